@@ -1,0 +1,1 @@
+"""Accurate specular reflections on curved objects for OpenUSD stages, in NVIDIA Warp."""

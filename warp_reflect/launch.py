@@ -1,0 +1,78 @@
+"""Kernel launch on one device or on several CPU threads: the only place that calls `wp.launch`.
+
+A Warp launch on the CPU is one loop on one thread. `launch` cuts it into slices that run at the same time;
+a kernel therefore takes the first index of its slice as its first argument and works on element
+`first + wp.tid()`. Warp's CPU atomics are plain memory operations: kernels launched here write only to
+elements that belong to their own index (or to their own row band, see raster.py), so that results are
+bit-equal at any number of threads.
+"""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+
+import warp as wp
+
+SPLIT_MIN = 4096  # elements below which the hand-off (20-60 us) costs more than the second thread saves
+SLICE_ALIGN = 64  # elements; slices that share a cache line of 4-byte results would ping-pong it
+
+
+@cache
+def _pool(thread_count: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(thread_count, thread_name_prefix="warp_reflect")
+
+
+def thread_count(device, threads: int = 0) -> int:
+    """Slices a launch is cut into: 1 on CUDA, else `threads`, or one per available core if 0."""
+    if wp.get_device(device).is_cuda:
+        return 1
+    if threads > 0:
+        return threads
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def slices(count: int, parts: int) -> list[tuple[int, int]]:
+    """`[0, count)` in at most `parts` aligned, contiguous, non-empty ranges (first, length)."""
+    step = -(-count // max(parts, 1))
+    step = -(-step // SLICE_ALIGN) * SLICE_ALIGN
+    return [(first, min(step, count - first)) for first in range(0, count, max(step, 1))]
+
+
+def launch(kernel, count: int, inputs: list, device, threads: int = 0, split_min: int = SPLIT_MIN) -> None:
+    """Run `kernel` for elements 0..count-1 and return when its outputs may be read by the next launch.
+
+    Args:
+        kernel: A kernel whose first argument is `first: int`, the first element of its slice.
+        count: Elements in all.
+        inputs: The arguments after `first`, outputs included.
+        device: Warp device.
+        threads: CPU threads; 0: one per core. Ignored on CUDA.
+        split_min: Smallest count that is split over threads.
+    """
+    if count <= 0:
+        return
+    parts = thread_count(device, threads)
+    if parts == 1 or count < split_min:
+        wp.launch(kernel, dim=count, inputs=[0, *inputs], device=device)
+        return
+    ranges = slices(count, parts)
+    # The module must be compiled and loaded before threads race for it.
+    kernel.module.load(wp.get_device(device))
+    run_parallel(
+        [
+            lambda first=first, length=length: wp.launch(kernel, dim=length, inputs=[first, *inputs], device=device)
+            for first, length in ranges
+        ]
+    )
+
+
+def run_parallel(jobs: list) -> None:
+    """Run the callables at the same time, the first on the calling thread; re-raise the first failure."""
+    if not jobs:
+        return
+    waiting = [_pool(max(len(jobs) - 1, 1)).submit(job) for job in jobs[1:]]
+    jobs[0]()
+    for job in waiting:
+        job.result()

@@ -1,0 +1,244 @@
+"""What passes between the steps of a frame: `Camera`, `GBuffer`, `MirrorPixels`, `ReflectionLayer`.
+
+Pixels are numbered row by row from the top: pixel = y * width + x, centre at (x + 0.5, y + 0.5).
+The *eye frame* has world axes and its origin at the eye.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import warp as wp
+
+from warp_reflect.scene import CameraData, Scene
+from warp_reflect.settings import Status
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class CameraView:
+    """Projection of eye-frame points to pixels and back.
+
+    Homogeneous pixel coordinates of p: X = dot(x_row.xyz, p) + x_row.w, likewise Y and W. Perspective: W is the depth
+    along `forward`; orthographic: W = 1.
+    """
+
+    eye: wp.vec3  # scene frame
+    forward: wp.vec3
+    x_row: wp.vec4
+    y_row: wp.vec4
+    w_row: wp.vec4
+    ray_corner: wp.vec3  # direction (perspective) or origin in the eye frame (orthographic) at pixel coordinate (0, 0)
+    ray_dx: wp.vec3
+    ray_dy: wp.vec3
+    orthographic: int
+    near: float
+    far: float
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A camera with an image size, float64 on the host.
+
+    Attributes:
+        eye: World position [3].
+        right, up, forward: Unit world directions [3].
+        fx, fy, cx, cy: pixel = (fx X/Z + cx, -fy Y/Z + cy); orthographic: without the division.
+        near, far: Depths along forward. [scene units]
+        size: (width, height). [pixels]
+    """
+
+    eye: np.ndarray
+    right: np.ndarray
+    up: np.ndarray
+    forward: np.ndarray
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    near: float
+    far: float
+    size: tuple[int, int]
+    orthographic: bool = False
+    path: str = ""
+
+    @classmethod
+    def from_data(cls, data: CameraData, size: tuple[int, int]) -> Camera:
+        """Film-back geometry of a UsdGeomCamera at an image size; pixels are square (the aperture is widened to fit,
+        UsdRender's `expandAperture`).
+        """
+        width, height = size
+        columns = data.world_from_camera[:3, :3].astype(np.float64)
+        axes = columns / np.linalg.norm(columns, axis=0)
+        aperture_x, aperture_y = data.horizontal_aperture, data.vertical_aperture
+        if aperture_x * height > aperture_y * width:
+            aperture_y = aperture_x * height / width
+        else:
+            aperture_x = aperture_y * width / height
+        if data.projection == "orthographic":
+            # Apertures of an orthographic camera are in tenths of a scene unit (UsdGeomCamera).
+            scale = 10.0
+        else:
+            scale = data.focal_length
+        fx, fy = width * scale / aperture_x, height * scale / aperture_y
+        return cls(
+            eye=data.world_from_camera[:3, 3].astype(np.float64),
+            right=axes[:, 0],
+            up=axes[:, 1],
+            forward=-axes[:, 2],
+            fx=fx,
+            fy=fy,
+            cx=width * (0.5 - data.horizontal_offset / aperture_x),
+            cy=height * (0.5 + data.vertical_offset / aperture_y),
+            near=data.near,
+            far=data.far,
+            size=(width, height),
+            orthographic=data.projection == "orthographic",
+            path=data.path,
+        )
+
+    def view(self, scene: Scene) -> CameraView:
+        """The device form, relative to the scene's origin."""
+        x = self.fx * self.right
+        y = -self.fy * self.up
+        view = CameraView()
+        view.eye = wp.vec3(*(self.eye - scene.origin))
+        view.forward = wp.vec3(*self.forward)
+        if self.orthographic:
+            view.x_row = wp.vec4(*x, self.cx)
+            view.y_row = wp.vec4(*y, self.cy)
+            view.w_row = wp.vec4(0.0, 0.0, 0.0, 1.0)
+            view.ray_corner = wp.vec3(*(-self.cx / self.fx * self.right + self.cy / self.fy * self.up))
+        else:
+            view.x_row = wp.vec4(*(x + self.cx * self.forward), 0.0)
+            view.y_row = wp.vec4(*(y + self.cy * self.forward), 0.0)
+            view.w_row = wp.vec4(*self.forward, 0.0)
+            view.ray_corner = wp.vec3(
+                *(self.forward - self.cx / self.fx * self.right + self.cy / self.fy * self.up)
+            )
+        view.ray_dx = wp.vec3(*(self.right / self.fx))
+        view.ray_dy = wp.vec3(*(-self.up / self.fy))
+        view.orthographic = int(self.orthographic)
+        view.near = self.near
+        view.far = self.far
+        view.width, view.height = self.size
+        return view
+
+
+@wp.func
+def eye_ray_direction(camera: CameraView, x: float, y: float) -> wp.vec3:
+    """Direction of the eye ray at pixel coordinate (x, y), world axes, not normalised (unit depth along forward)."""
+    if camera.orthographic != 0:
+        return camera.forward
+    return camera.ray_corner + x * camera.ray_dx + y * camera.ray_dy
+
+
+@wp.func
+def eye_ray_origin(camera: CameraView, x: float, y: float) -> wp.vec3:
+    """Origin of the eye ray at pixel coordinate (x, y), eye frame."""
+    if camera.orthographic != 0:
+        return camera.ray_corner + x * camera.ray_dx + y * camera.ray_dy
+    return wp.vec3(0.0, 0.0, 0.0)
+
+
+@wp.func
+def project(camera: CameraView, p_eye: wp.vec3) -> wp.vec4:
+    """Pixel coordinates and depth key of an eye-frame point: (x, y, key, w).
+
+    The key grows towards the eye and is linear on the screen: 1/depth (perspective) or 1 - depth/far (orthographic).
+    In front of the near plane (x, y) stay homogeneous and the key is 0, for the clipper.
+    """
+    depth = wp.dot(camera.forward, p_eye)
+    x = camera.x_row[0] * p_eye[0] + camera.x_row[1] * p_eye[1] + camera.x_row[2] * p_eye[2] + camera.x_row[3]
+    y = camera.y_row[0] * p_eye[0] + camera.y_row[1] * p_eye[1] + camera.y_row[2] * p_eye[2] + camera.y_row[3]
+    if camera.orthographic != 0:
+        if depth < camera.near:
+            return wp.vec4(x, y, 0.0, depth)
+        return wp.vec4(x, y, 1.0 - depth / camera.far, depth)
+    if depth < camera.near:
+        return wp.vec4(x, y, 0.0, depth)
+    inv = 1.0 / depth
+    return wp.vec4(x * inv, y * inv, inv, depth)
+
+
+@dataclass
+class GBuffer:
+    """What the eye sees: per pixel the nearest triangle.
+
+    Attributes:
+        triangle: int32 [height * width], -1 background.
+        depth_key: float32 [height * width], see `project`; 0 background.
+    """
+
+    camera: Camera
+    view: CameraView
+    triangle: wp.array
+    depth_key: wp.array
+
+
+@dataclass
+class MirrorPixels:
+    """The pixels at which one reflector is seen, compacted, with the surface every technique reflects at.
+
+    Attributes:
+        reflector: 1-based id.
+        pixel: int32 [n], ascending.
+        point: vec3 [n], scene frame: P on the mirror.
+        normal: vec3 [n], unit, on the eye's side.
+        direction: vec3 [n], unit reflected direction.
+        box: (x0, y0, x1, y1), half-open bounds of the pixels.
+    """
+
+    reflector: int
+    pixel: wp.array
+    point: wp.array
+    normal: wp.array
+    direction: wp.array
+    box: tuple[int, int, int, int]
+
+    @property
+    def count(self) -> int:
+        return len(self.pixel)
+
+
+@dataclass
+class ReflectionLayer:
+    """The common answer of every technique for the pixels of one reflector, in the order of its `MirrorPixels`.
+
+    Attributes:
+        pixels: The pixels answered.
+        method: `Technique` of the answer.
+        triangle: int32 [n], the triangle seen in the mirror, -1 none.
+        u, v: float32 [n], barycentric weights of its second and third corner at the hit.
+        distance: float32 [n], from P to the hit along the reflected direction. [scene units]
+        status: uint8 [n], `Status`.
+        statistics: Counts of who settled the pixels, and of what the search met.
+        history: What the next frame may start from.
+    """
+
+    pixels: MirrorPixels
+    method: int
+    triangle: wp.array
+    u: wp.array
+    v: wp.array
+    distance: wp.array
+    status: wp.array
+    statistics: dict = field(default_factory=dict)
+    history: object = None
+
+    @classmethod
+    def empty(cls, pixels: MirrorPixels, method: int, device) -> ReflectionLayer:
+        n = pixels.count
+        return cls(
+            pixels=pixels,
+            method=int(method),
+            triangle=wp.full(n, -1, dtype=int, device=device),
+            u=wp.zeros(n, dtype=float, device=device),
+            v=wp.zeros(n, dtype=float, device=device),
+            distance=wp.zeros(n, dtype=float, device=device),
+            status=wp.full(n, int(Status.NONE), dtype=wp.uint8, device=device),
+        )

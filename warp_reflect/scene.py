@@ -1,0 +1,455 @@
+"""What a stage holds, as plain arrays (`SceneData`), and the same on a device (`Scene`).
+
+Frames: *object* (a mesh's own), *world* (the stage's, float64 on the host) and *scene*: world axes with the
+origin moved to `Scene.origin` (float64), so that float32 device arrays stay near zero at any stage offset.
+Matrices act on columns: `p_world = world_from_object @ [p, 1]`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+
+@dataclass(frozen=True)
+class Note:
+    """One thing a user should know about a prim: repaired, dropped, defaulted, or met and not used."""
+
+    path: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Shape:
+    """The analytic surface behind a patch of triangles (gprims).
+
+    `kind` "quadric": x^2 + y^2 + a z^2 + b z - c = 0 in the unit frame between z_min and z_max (the form of Lages
+    Miguel et al. 2014, equation 1, with the paper's b). `kind` "plane": z = 0 in the unit frame, normal +z.
+    """
+
+    kind: str
+    unit_from_object: np.ndarray  # float64 [4, 4]
+    a: float = 0.0
+    b: float = 0.0
+    c: float = 0.0
+    z_min: float = -np.inf
+    z_max: float = np.inf
+
+
+@dataclass(frozen=True)
+class Patch:
+    """A contiguous range of a mesh's triangles with one surface."""
+
+    first_triangle: int
+    triangle_count: int
+    shape: Shape | None = None
+
+
+@dataclass(frozen=True)
+class Part:
+    """A contiguous range of a mesh's triangles with one material: the whole mesh, or one GeomSubset."""
+
+    first_triangle: int
+    triangle_count: int
+    subset: str = ""
+    patches: tuple[Patch, ...] = ()  # empty: one patch without a shape
+
+
+@dataclass
+class MeshData:
+    """One prototype in object space; triangles are ordered part by part and wound so that outside is counter-clockwise.
+
+    Corner attributes are indexed apart from the points, so that USD point indices stay the topology.
+    """
+
+    points: np.ndarray  # float32 [vertex_count, 3]
+    triangles: np.ndarray  # int32 [triangle_count, 3]
+    normals: np.ndarray | None = None  # float32 [n, 3], unit; None: flat facets
+    normal_index: np.ndarray | None = None  # int32 [triangle_count, 3]; None with normals: same as triangles
+    uvs: np.ndarray | None = None  # float32 [n, 2]
+    uv_index: np.ndarray | None = None
+    colors: np.ndarray | None = None  # float32 [n, 3]: a displayColor that varies over the mesh, linear Rec.709
+    color_index: np.ndarray | None = None
+    parts: list[Part] = field(default_factory=list)  # empty: one part
+    double_sided: bool = False
+
+
+@dataclass
+class InstanceData:
+    """A mesh placed in the world: one drawn prim."""
+
+    mesh: int
+    world_from_object: np.ndarray  # float64 [4, 4]
+    prim_path: str
+    materials: tuple[int, ...]  # one per part, index into SceneData.materials
+    instance: str = ""  # which copy, where several share prim_path (point instancers)
+
+
+@dataclass(frozen=True)
+class MaterialData:
+    """UsdPreviewSurface parameters; colours linear Rec.709."""
+
+    path: str = ""
+    base_color: tuple[float, float, float] = (0.18, 0.18, 0.18)
+    metallic: float = 0.0
+    roughness: float = 0.5
+    ior: float = 1.5
+    specular_workflow: bool = False
+    specular_color: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    opacity: float = 1.0
+    emissive: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    clearcoat: float = 0.0
+    clearcoat_roughness: float = 0.01
+    uses_vertex_color: bool = False  # base_color is replaced by MeshData.colors
+
+
+@dataclass(frozen=True)
+class LightData:
+    """A dome (radiance from all sides) or a distant light."""
+
+    path: str
+    kind: str  # "dome" | "distant"
+    color: tuple[float, float, float]  # dome: radiance; distant: irradiance on a facing surface
+    world_from_light: np.ndarray  # float64 [4, 4]; a distant light shines along its -Z
+    texture: np.ndarray | None = None  # float32 [h, w, 3], linear, latlong in OpenEXR orientation
+
+
+@dataclass(frozen=True)
+class CameraData:
+    """A UsdGeomCamera. Apertures and focal length share one unit (tenths of a scene unit), clipping in scene units."""
+
+    path: str
+    world_from_camera: np.ndarray  # float64 [4, 4]; looks along -Z, +Y up
+    projection: str = "perspective"  # or "orthographic"
+    horizontal_aperture: float = 20.955
+    vertical_aperture: float = 15.2908
+    horizontal_offset: float = 0.0
+    vertical_offset: float = 0.0
+    focal_length: float = 50.0
+    near: float = 1.0
+    far: float = 1.0e6
+
+
+@dataclass
+class SceneData:
+    """A stage at one time as plain arrays: what crosses a process boundary, and all a `Scene` is made from."""
+
+    source: str
+    meshes: list[MeshData]
+    instances: list[InstanceData]
+    materials: list[MaterialData]
+    lights: list[LightData]
+    cameras: list[CameraData]
+    notes: list[Note] = field(default_factory=list)
+    up_axis: str = "Y"
+    meters_per_unit: float = 0.01
+    time: float | None = None
+    time_range: tuple[float, float] | None = None
+    time_codes_per_second: float = 24.0
+
+
+# Shape kinds on the device.
+SHAPE_NONE = wp.constant(0)
+SHAPE_QUADRIC = wp.constant(1)
+SHAPE_PLANE = wp.constant(2)
+
+
+@wp.struct
+class PatchView:
+    """A patch of one instance: which surface, material and prim its triangles belong to."""
+
+    first_triangle: int
+    triangle_count: int
+    part: int  # index into Scene.parts
+    prim: int  # 1-based id of the prim
+    material: int
+    double_sided: int
+    shape: int
+    quadric: wp.vec3  # a, b, c of Shape
+    unit_from_scene: wp.mat44
+
+
+@wp.struct
+class MaterialView:
+    base_color: wp.vec3
+    f0: wp.vec3  # mirror weight at normal incidence
+    f90: wp.vec3
+    diffuse: wp.vec3  # Lambert albedo, (1 - metallic) applied
+    emissive: wp.vec3
+    metallic: float
+    roughness: float
+    opacity: float
+    clearcoat: float
+    clearcoat_f0: float
+    uses_vertex_color: int
+
+
+@wp.struct
+class SceneView:
+    """Device arrays of a scene, in the scene frame."""
+
+    points: wp.array(dtype=wp.vec3)
+    triangles: wp.array(dtype=wp.vec3i)
+    normals: wp.array(dtype=wp.vec3)
+    normal_index: wp.array(dtype=wp.vec3i)  # (-1, -1, -1): flat
+    colors: wp.array(dtype=wp.vec3)
+    color_index: wp.array(dtype=wp.vec3i)  # length 0 where no mesh has varying colours
+    triangle_patch: wp.array(dtype=int)
+    patches: wp.array(dtype=PatchView)
+    materials: wp.array(dtype=MaterialView)
+
+
+@dataclass(frozen=True)
+class PartRange:
+    """One (prim instance, material subset) of a `Scene`: what a reflector is."""
+
+    prim_path: str
+    subset: str
+    instance: str
+    prim: int  # 1-based
+    material: int
+    first_triangle: int
+    triangle_count: int
+    first_vertex: int  # of the whole instance
+    vertex_count: int
+    patches: range  # indices into Scene.patch_shapes
+    world_from_object: np.ndarray
+
+
+class Scene:
+    """A `SceneData` on a device.
+
+    Attributes:
+        data: The host arrays it was made from.
+        origin: float64 [3]; scene frame = world - origin.
+        view: `SceneView` for kernels.
+        parts: `PartRange` per (prim instance, subset), in triangle order.
+        notes: What the user should know, one `Note` each.
+    """
+
+    def __init__(self, data: SceneData, device: str = "cpu", reload=None):
+        self.data = data
+        self.device = wp.get_device(device)
+        self.notes = list(data.notes)
+        self._reload = reload
+        self.origin = _scene_origin(data)
+        self._flatten()
+
+    @property
+    def triangle_count(self) -> int:
+        return len(self.host_triangles)
+
+    @property
+    def vertex_count(self) -> int:
+        return len(self.host_points)
+
+    @property
+    def prims(self) -> dict[int, str]:
+        """Prim id (1-based, the `primId` channel) to prim path."""
+        return {
+            i + 1: inst.prim_path + (f"[{inst.instance}]" if inst.instance else "")
+            for i, inst in enumerate(self.data.instances)
+        }
+
+    @property
+    def size(self) -> float:
+        """Length of the diagonal of the bounds. [scene units]"""
+        if not self.vertex_count:
+            return 1.0
+        return float(np.linalg.norm(np.ptp(self.host_points.astype(np.float64), axis=0))) or 1.0
+
+    def at(self, time: float | None) -> Scene:
+        """The same stage at another time code; what does not change in time is read once and shared."""
+        if self._reload is None or time == self.data.time:
+            return self
+        return self._reload(time)
+
+    @cached_property
+    def neighbours(self) -> wp.array:
+        """Per triangle the triangle across each edge (v0v1, v1v2, v2v0), -1 where there is none. vec3i [triangle_count]"""
+        return wp.array(edge_neighbours(self.host_triangles), dtype=wp.vec3i, device=self.device)
+
+    @cached_property
+    def tracer(self):
+        """The owner of the scene's ray acceleration structure (`bvh.Tracer`), built at first use."""
+        from warp_reflect import bvh
+
+        return bvh.Tracer(self)
+
+    def _flatten(self) -> None:
+        """Lay instances out one after the other in the scene frame."""
+        data = self.data
+        points, triangles, normals, normal_index, colors, color_index = [], [], [], [], [], []
+        triangle_patch, patches, self.parts, self.patch_shapes = [], [], [], []
+        first_vertex = first_triangle = first_normal = first_color = 0
+        any_color = any(mesh.colors is not None for mesh in data.meshes)
+        scene_from_world = np.eye(4)
+        scene_from_world[:3, 3] = -self.origin
+        for prim, inst in enumerate(data.instances, 1):
+            mesh = data.meshes[inst.mesh]
+            count = len(mesh.triangles)
+            scene_from_object = scene_from_world @ inst.world_from_object
+            linear = scene_from_object[:3, :3]
+            flip = np.linalg.det(linear) < 0.0
+            order = [0, 2, 1] if flip else [0, 1, 2]
+            points.append((mesh.points.astype(np.float64) @ linear.T + scene_from_object[:3, 3]).astype(np.float32))
+            triangles.append(mesh.triangles[:, order] + np.int32(first_vertex))
+            if mesh.normals is None:
+                normal_index.append(np.full((count, 3), -1, np.int32))
+            else:
+                transformed = mesh.normals.astype(np.float64) @ np.linalg.inv(linear)
+                transformed /= np.maximum(np.linalg.norm(transformed, axis=1, keepdims=True), 1e-300)
+                normals.append(transformed.astype(np.float32))
+                index = mesh.triangles if mesh.normal_index is None else mesh.normal_index
+                normal_index.append(index[:, order] + np.int32(first_normal))
+                first_normal += len(mesh.normals)
+            if any_color:
+                if mesh.colors is None:
+                    color_index.append(np.full((count, 3), -1, np.int32))
+                else:
+                    colors.append(mesh.colors.astype(np.float32))
+                    index = mesh.triangles if mesh.color_index is None else mesh.color_index
+                    color_index.append(index[:, order] + np.int32(first_color))
+                    first_color += len(mesh.colors)
+            object_from_scene = np.linalg.inv(scene_from_object)
+            for k, part in enumerate(mesh.parts or [Part(0, count)]):
+                material = inst.materials[k]
+                first_patch = len(patches)
+                for patch in part.patches or (Patch(part.first_triangle, part.triangle_count),):
+                    triangle_patch.append(np.full(patch.triangle_count, len(patches), np.int32))
+                    patches.append(
+                        _patch_view(patch, first_triangle, len(self.parts), prim, material, mesh, object_from_scene)
+                    )
+                    self.patch_shapes.append(patch.shape)
+                self.parts.append(
+                    PartRange(
+                        inst.prim_path,
+                        part.subset,
+                        inst.instance,
+                        prim,
+                        material,
+                        first_triangle + part.first_triangle,
+                        part.triangle_count,
+                        first_vertex,
+                        len(mesh.points),
+                        range(first_patch, len(patches)),
+                        inst.world_from_object,
+                    )
+                )
+            first_vertex += len(mesh.points)
+            first_triangle += count
+        self.host_points = _stack(points, (0, 3), np.float32)
+        self.host_triangles = _stack(triangles, (0, 3), np.int32)
+        self.host_triangle_patch = _stack(triangle_patch, (0,), np.int32)
+        self.host_normals = _stack(normals, (0, 3), np.float32)
+        self.host_normal_index = _stack(normal_index, (0, 3), np.int32)
+        view = SceneView()
+        view.points = wp.array(self.host_points, dtype=wp.vec3, device=self.device)
+        view.triangles = wp.array(self.host_triangles, dtype=wp.vec3i, device=self.device)
+        view.normals = wp.array(self.host_normals, dtype=wp.vec3, device=self.device)
+        view.normal_index = wp.array(self.host_normal_index, dtype=wp.vec3i, device=self.device)
+        view.colors = wp.array(_stack(colors, (0, 3), np.float32), dtype=wp.vec3, device=self.device)
+        view.color_index = wp.array(_stack(color_index, (0, 3), np.int32), dtype=wp.vec3i, device=self.device)
+        view.triangle_patch = wp.array(self.host_triangle_patch, dtype=int, device=self.device)
+        view.patches = wp.array(patches, dtype=PatchView, device=self.device)
+        view.materials = wp.array([material_view(m) for m in data.materials], dtype=MaterialView, device=self.device)
+        self.view = view
+
+
+def _stack(arrays: list, empty: tuple, dtype) -> np.ndarray:
+    return np.concatenate(arrays).astype(dtype, copy=False) if arrays else np.zeros(empty, dtype)
+
+
+def _patch_view(patch, first_triangle, part, prim, material, mesh, object_from_scene) -> PatchView:
+    view = PatchView()
+    view.first_triangle = first_triangle + patch.first_triangle
+    view.triangle_count = patch.triangle_count
+    view.part = part
+    view.prim = prim
+    view.material = material
+    view.double_sided = int(mesh.double_sided)
+    view.unit_from_scene = wp.mat44(np.eye(4, dtype=np.float32))
+    if patch.shape is not None:
+        view.shape = int(SHAPE_QUADRIC if patch.shape.kind == "quadric" else SHAPE_PLANE)
+        view.quadric = wp.vec3(patch.shape.a, patch.shape.b, patch.shape.c)
+        unit_from_scene = patch.shape.unit_from_object @ object_from_scene
+        view.unit_from_scene = wp.mat44(unit_from_scene.astype(np.float32))
+    return view
+
+
+def reflectance(material: MaterialData) -> tuple[np.ndarray, np.ndarray]:
+    """(F0, F90) of a material's mirror term as UsdPreviewSurface defines it, linear RGB [3] each.
+
+    Source: UsdPreviewSurface specification: metallic workflow F0 = lerp(((1-ior)/(1+ior))^2, baseColor, metallic),
+    F90 = lerp(1, baseColor, metallic); specular workflow F0 = specularColor, F90 = 1.
+    """
+    if material.specular_workflow:
+        return np.asarray(material.specular_color, float), np.ones(3)
+    base = np.asarray(material.base_color, float)
+    dielectric = ((1.0 - material.ior) / (1.0 + material.ior)) ** 2
+    m = material.metallic
+    return (1.0 - m) * dielectric + m * base, (1.0 - m) + m * base
+
+
+def material_view(material: MaterialData) -> MaterialView:
+    """The device form of a material."""
+    f0, f90 = reflectance(material)
+    view = MaterialView()
+    view.base_color = wp.vec3(*material.base_color)
+    view.f0 = wp.vec3(*f0)
+    view.f90 = wp.vec3(*f90)
+    kept = 1.0 if material.specular_workflow else 1.0 - material.metallic
+    view.diffuse = wp.vec3(*(kept * np.asarray(material.base_color)))
+    view.emissive = wp.vec3(*material.emissive)
+    view.metallic = 0.0 if material.specular_workflow else material.metallic
+    view.roughness = material.roughness
+    view.opacity = material.opacity
+    view.clearcoat = material.clearcoat
+    view.clearcoat_f0 = ((1.0 - material.ior) / (1.0 + material.ior)) ** 2
+    view.uses_vertex_color = int(material.uses_vertex_color)
+    return view
+
+
+def _scene_origin(data: SceneData) -> np.ndarray:
+    """Middle of the instances' positions (a median, which one stray prim cannot drag away)."""
+    if not data.instances:
+        return np.zeros(3)
+    centres = []
+    for inst in data.instances:
+        points = data.meshes[inst.mesh].points
+        middle = 0.5 * (points.min(axis=0) + points.max(axis=0)).astype(np.float64) if len(points) else np.zeros(3)
+        centres.append(inst.world_from_object[:3, :3] @ middle + inst.world_from_object[:3, 3])
+    return np.median(np.asarray(centres), axis=0)
+
+
+def edge_neighbours(triangles: np.ndarray) -> np.ndarray:
+    """Per triangle the triangle across each edge (v0v1, v1v2, v2v0); -1 at borders and where more than two meet.
+
+    Args:
+        triangles: Vertex indices, int [triangle_count, 3].
+
+    Returns:
+        int32 [triangle_count, 3].
+    """
+    count = len(triangles)
+    result = np.full(3 * count, -1, np.int32)
+    if count:
+        starts = triangles.reshape(-1).astype(np.int64)
+        ends = triangles[:, [1, 2, 0]].reshape(-1).astype(np.int64)
+        key = np.minimum(starts, ends) * (int(triangles.max()) + 1) + np.maximum(starts, ends)
+        order = np.argsort(key, kind="stable")
+        ordered = key[order]
+        same = ordered[1:] == ordered[:-1]
+        # Exactly two uses of an edge: equal to the next one, and to no other on either side.
+        pair = same.copy()
+        pair[1:] &= ~same[:-1]
+        pair[:-1] &= ~same[1:]
+        left, right = order[:-1][pair], order[1:][pair]
+        result[left] = right // 3
+        result[right] = left // 3
+    return result.reshape(count, 3)

@@ -1,0 +1,139 @@
+"""Named settings and the closed sets of the package: `Status`, `Technique`, `Settings`."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+from dataclasses import dataclass
+from enum import IntEnum
+
+
+class Status(IntEnum):
+    """What an answer is worth. Every point, pixel and ray carries one; it comes from the residual."""
+
+    NONE = 0
+    """Nothing was asked: no reflection here."""
+    CONVERGED = 1
+    """A reflection point (or an exact hit) that fulfils the law of reflection within the tolerance."""
+    SKY = 2
+    """The reflected ray leaves the scene."""
+    HIDDEN = 3
+    """The reflector itself stands between the eye and the point."""
+    UNREFLECTED = 4
+    """The point lies in neither the reflected nor the hidden region of an open reflector."""
+    GRAZING = 5
+    """Incidence so close to 90 degrees that the answer is not resolved in this precision."""
+    MAX_ITERATIONS = 6
+    """The search ended at its bound with a residual above the tolerance; the best point is given."""
+    DEGENERATE = 7
+    """The geometry admits no direction (a zero normal, a bisector of length zero)."""
+    AMBIGUOUS = 8
+    """A continuum of equally good answers (a ring on an axis); one fixed member is given."""
+    NEAR_CAUSTIC = 9
+    """Two roots are about to merge; about half of the digits are lost."""
+    INSIDE = 10
+    """The eye or the point lies inside the reflector's body."""
+    BAD_INPUT = 11
+    """Not finite, or the eye or the point lies on the surface where it may not."""
+    OUT_OF_EXTENT = 12
+    """The reflection point lies outside the mirror's outline."""
+    STEP_LIMIT = 13
+    """A traversal ended at its step bound."""
+    DEPTH_LIMIT = 14
+    """A recursion ended at its depth bound."""
+
+
+class Technique(IntEnum):
+    """Who answered a pixel; the `method` channel."""
+
+    NONE = 0
+    RAYTRACED = 1
+    PLANAR = 2
+    QUADRIC = 3
+    REFLECTOR_MAP = 4
+    EXPLOSION_MAP = 5
+    ENVIRONMENT = 6
+    LAYERED_ENVIRONMENT = 7
+
+
+SEARCHES = ("newton", "midpoint")
+REFINEMENTS = ("exact", "off")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Every knob of a plan. Unknown names and impossible values are a `ValueError` that says what is possible."""
+
+    search: str = "newton"
+    """`newton` (the default) or `midpoint`, the search of Estalella et al. 2005, section 4.3."""
+    iterations: int = 0
+    """Bound on the search's map evaluations per vertex; 0: the search's own default."""
+    tolerance: float = 0.0
+    """Residual sine at which a search stops; 0: 0.1 h^2 of the map's texel size h (below that the map is wrong)."""
+    map_resolution: int = 128
+    """Nodes along a cube edge of a reflector map. [nodes]"""
+    refine: str = "exact"
+    """`exact` (every pixel gets the hit of an exact ray-triangle test) or `off` (the papers' picture)."""
+    walk_hops: int = 4
+    """Neighbour triangles a refinement may walk over before the BVH decides."""
+    complexity: str = "low"
+    """`low`, `medium`, `high`, `veryhigh`: subdivision level 0-3, and the tessellation of gprims, as in usdrecord."""
+    threads: int = 0
+    """CPU threads of a launch; 0: one per core."""
+    shadows: bool = False
+    """Shadow rays towards distant lights."""
+    reflector_max_roughness: float = 0.05
+    """A material rougher than this is not treated as a mirror."""
+    reflector_min_weight: float = 0.2
+    """A material whose mirror weight at normal incidence is below this is not treated as a mirror."""
+
+    def __post_init__(self) -> None:
+        _require(self.search in SEARCHES, "search", self.search, f"one of {', '.join(SEARCHES)}")
+        _require(self.refine in REFINEMENTS, "refine", self.refine, f"one of {', '.join(REFINEMENTS)}")
+        _require(self.complexity in COMPLEXITIES, "complexity", self.complexity, f"one of {', '.join(COMPLEXITIES)}")
+        _require(0 <= self.iterations <= 1000, "iterations", self.iterations, "0 to 1000")
+        _require(0.0 <= self.tolerance < 1.0, "tolerance", self.tolerance, "0 to 1 (a sine)")
+        _require(8 <= self.map_resolution <= 2048, "map_resolution", self.map_resolution, "8 to 2048 nodes")
+        _require(0 <= self.walk_hops <= 64, "walk_hops", self.walk_hops, "0 to 64")
+        _require(0 <= self.threads <= 1024, "threads", self.threads, "0 (all cores) to 1024")
+        _require(0.0 <= self.reflector_max_roughness <= 1.0, "reflector_max_roughness", self.reflector_max_roughness, "0 to 1")
+        _require(0.0 <= self.reflector_min_weight <= 1.0, "reflector_min_weight", self.reflector_min_weight, "0 to 1")
+
+    @classmethod
+    def names(cls) -> tuple[str, ...]:
+        """The names `--set` and `replace` accept."""
+        return tuple(field.name for field in dataclasses.fields(cls))
+
+    def replace(self, **changes) -> Settings:
+        """A copy with the named settings changed; strings are converted to the setting's type.
+
+        Raises:
+            ValueError: an unknown name (with the nearest known ones), or a value that cannot be.
+        """
+        types = {field.name: type(field.default) for field in dataclasses.fields(self)}
+        values = {}
+        for name, value in changes.items():
+            if name not in types:
+                near = difflib.get_close_matches(name, types, n=3, cutoff=0.4)
+                raise ValueError(f"unknown setting '{name}'; nearest: {', '.join(near or types)}")
+            values[name] = _convert(name, value, types[name])
+        return dataclasses.replace(self, **values)
+
+
+COMPLEXITIES = ("low", "medium", "high", "veryhigh")
+
+
+def _require(good: bool, name: str, got, expected: str) -> None:
+    if not good:
+        raise ValueError(f"setting '{name}': got {got!r}, expected {expected}")
+
+
+def _convert(name: str, value, kind: type):
+    if isinstance(value, kind) and not (kind is int and isinstance(value, bool)):
+        return value
+    try:
+        if kind is bool:
+            return {"1": True, "true": True, "on": True, "0": False, "false": False, "off": False}[str(value).lower()]
+        return kind(value)
+    except (KeyError, TypeError, ValueError):
+        raise ValueError(f"setting '{name}': got {value!r}, expected a value of type {kind.__name__}") from None

@@ -1,0 +1,1 @@
+"""One method a file; see `warp_reflect.techniques.TECHNIQUES`."""
