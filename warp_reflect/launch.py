@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
+from functools import cache, partial
 
 import warp as wp
 
@@ -33,11 +33,13 @@ def thread_count(device, threads: int = 0) -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def slices(count: int, parts: int) -> list[tuple[int, int]]:
-    """`[0, count)` in at most `parts` aligned, contiguous, non-empty ranges (first, length)."""
-    step = -(-count // max(parts, 1))
-    step = -(-step // SLICE_ALIGN) * SLICE_ALIGN
-    return [(first, min(step, count - first)) for first in range(0, count, max(step, 1))]
+def slice_length(count: int, device, threads: int = 0, split_min: int = SPLIT_MIN) -> int:
+    """Elements of every slice but the last of a launch over `count` elements (all of them where it is not split)."""
+    parts = thread_count(device, threads)
+    if parts == 1 or count < split_min:
+        return count
+    step = -(-count // parts)
+    return -(-step // SLICE_ALIGN) * SLICE_ALIGN
 
 
 def launch(kernel, count: int, inputs: list, device, threads: int = 0, split_min: int = SPLIT_MIN) -> None:
@@ -53,19 +55,36 @@ def launch(kernel, count: int, inputs: list, device, threads: int = 0, split_min
     """
     if count <= 0:
         return
-    parts = thread_count(device, threads)
-    if parts == 1 or count < split_min:
+    step = slice_length(count, device, threads, split_min)
+    if step >= count:
         wp.launch(kernel, dim=count, inputs=[0, *inputs], device=device)
         return
-    ranges = slices(count, parts)
-    # The module must be compiled and loaded before threads race for it.
-    kernel.module.load(wp.get_device(device))
+    _load(kernel, device)
     run_parallel(
         [
-            lambda first=first, length=length: wp.launch(kernel, dim=length, inputs=[first, *inputs], device=device)
-            for first, length in ranges
+            partial(wp.launch, kernel, dim=min(step, count - first), inputs=[first, *inputs], device=device)
+            for first in range(0, count, step)
         ]
     )
+
+
+def launch_bands(kernel, ranges: list[tuple[int, int]], bands: list[tuple[int, int]], inputs: list, device) -> None:
+    """Run `kernel` over every (first, length) range once per band, the bands at the same time.
+
+    The kernel's last two arguments are the rows [row_first, row_end) of its band; it writes nothing outside them.
+    """
+    _load(kernel, device)
+
+    def draw(band: tuple[int, int]) -> None:
+        for first, length in ranges:
+            wp.launch(kernel, dim=length, inputs=[first, *inputs, *band], device=device)
+
+    run_parallel([partial(draw, band) for band in bands])
+
+
+def _load(kernel, device) -> None:
+    # The module must be compiled and loaded before threads race for it.
+    kernel.module.load(wp.get_device(device))
 
 
 def run_parallel(jobs: list) -> None:

@@ -1,0 +1,454 @@
+"""The z-buffer rasteriser: the eye view, cube faces and virtual meshes all go through `rasterise`.
+
+Coverage is decided in integers: pixel coordinates are rounded to 1/256 pixel and edge functions are exact 64-bit
+sums, with the top-left rule, so that triangles that share an edge own each pixel centre exactly once. Depth is a key
+that is linear on the screen and grows towards the eye (`layers.project`); ties go to the lower triangle id, so a
+picture does not depend on the order of drawing. Two phases: `cull_kernel` keeps the triangles that cover a pixel centre
+of the target (each CPU slice compacts its own), `draw_kernel` draws the survivors, each CPU thread its own band of rows.
+
+Source of the fixed-point rule: Direct3D 11.3 functional specification, section 3.4 (coordinate snapping and the
+top-left rule); 8 sub-pixel bits as there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from warp_reflect.launch import launch, launch_bands, slice_length
+from warp_reflect.layers import Camera, CameraView, GBuffer, project
+from warp_reflect.scene import Scene
+
+wp.set_module_options({"enable_backward": False})
+
+SUBPIXEL = wp.constant(256)  # positions per pixel
+HALF_PIXEL = wp.constant(128)
+# Pixels. Beyond it a triangle is clipped: 2^14 * 2^8 = 2^22 keeps every product below 2^46, far inside int64.
+GUARD = wp.constant(16384.0)
+DROPPED = wp.constant(-1.0)  # depth key of a vertex that has no picture
+CLIP_VERTICES = 9  # a triangle against five planes has at most eight corners
+
+_polygon = wp.types.matrix(shape=(CLIP_VERTICES, 4), dtype=wp.float32)
+
+
+@wp.struct
+class TargetView:
+    """A z-buffer over the box [x0, x1) x [y0, y1) of an image of the given width."""
+
+    key: wp.array(dtype=wp.uint64)  # row-major over the box; 0 empty
+    x0: int
+    y0: int
+    x1: int
+    y1: int
+    mask: wp.array(dtype=int)  # per image pixel; drawn only where equal to mask_value
+    mask_value: int  # 0: no mask
+    mask_width: int
+    key_min: float  # depth keys at or below it lie beyond the far plane
+    near: float
+    far: float
+    orthographic: int
+
+
+@dataclass
+class Target:
+    """A z-buffer and where it lies in its image."""
+
+    view: TargetView
+    key: wp.array
+    box: tuple[int, int, int, int]
+
+
+@wp.func
+def pack_key(depth_key: float, triangle: int) -> wp.uint64:
+    # Positive floats order like their bits; the complement makes the lower id win a tie.
+    return (wp.uint64(wp.cast(depth_key, wp.uint32)) << wp.uint64(32)) | wp.uint64(~wp.uint32(triangle))
+
+
+@wp.func
+def key_triangle(key: wp.uint64) -> int:
+    """Triangle id of a z-buffer key, -1 where nothing was drawn."""
+    if key == wp.uint64(0):
+        return -1
+    return int(~wp.uint32(key & wp.uint64(0xFFFFFFFF)))
+
+
+@wp.func
+def key_depth(key: wp.uint64) -> float:
+    """Depth key of a z-buffer key, 0 where nothing was drawn."""
+    return wp.cast(wp.uint32(key >> wp.uint64(32)), wp.float32)
+
+
+@wp.func
+def snap(x: float) -> int:
+    return int(wp.floor(x * float(SUBPIXEL) + 0.5))
+
+
+@wp.func
+def needs_clipping(v: wp.vec4) -> bool:
+    return v[2] == 0.0 or wp.abs(v[0]) > GUARD or wp.abs(v[1]) > GUARD
+
+
+@wp.func
+def first_centre(low: int) -> int:
+    """First pixel whose centre lies at or right of a snapped coordinate."""
+    return (low - HALF_PIXEL + SUBPIXEL - 1) >> 8
+
+
+@wp.func
+def last_centre(high: int) -> int:
+    return (high - HALF_PIXEL) >> 8
+
+
+@wp.func
+def edge_bias(dx: wp.int64, dy: wp.int64) -> wp.int64:
+    # Top-left rule for positive area with y down: a pixel centre on a left or top edge is inside.
+    if dy < wp.int64(0) or (dy == wp.int64(0) and dx > wp.int64(0)):
+        return wp.int64(0)
+    return wp.int64(-1)
+
+
+@wp.func
+def pixel_step(d: wp.int64) -> wp.int64:
+    # Apart from its caller: Warp merges equal constants of one function whatever their types.
+    return d * wp.int64(256)
+
+
+@wp.func
+def draw_triangle(
+    target: TargetView, a: wp.vec3, b: wp.vec3, c: wp.vec3, triangle: int, row_first: int, row_end: int
+):
+    """Draw one triangle of (x, y, key) corners into rows [row_first, row_end) of the image."""
+    xa = snap(a[0])
+    ya = snap(a[1])
+    xb = snap(b[0])
+    yb = snap(b[1])
+    xc = snap(c[0])
+    yc = snap(c[1])
+    kb = b[2]
+    kc = c[2]
+    area = wp.int64(xb - xa) * wp.int64(yc - ya) - wp.int64(yb - ya) * wp.int64(xc - xa)
+    if area == wp.int64(0):
+        return
+    if area < wp.int64(0):
+        area = -area
+        x = xb
+        xb = xc
+        xc = x
+        y = yb
+        yb = yc
+        yc = y
+        k = kb
+        kb = kc
+        kc = k
+    left = wp.max(first_centre(wp.min(xa, wp.min(xb, xc))), target.x0)
+    right = wp.min(last_centre(wp.max(xa, wp.max(xb, xc))), target.x1 - 1)
+    top = wp.max(first_centre(wp.min(ya, wp.min(yb, yc))), wp.max(target.y0, row_first))
+    bottom = wp.min(last_centre(wp.max(ya, wp.max(yb, yc))), wp.min(target.y1, row_end) - 1)
+    if left > right or top > bottom:
+        return
+    dxa = wp.int64(xc - xb)
+    dya = wp.int64(yc - yb)
+    dxb = wp.int64(xa - xc)
+    dyb = wp.int64(ya - yc)
+    dxc = wp.int64(xb - xa)
+    dyc = wp.int64(yb - ya)
+    px = wp.int64(left * SUBPIXEL + HALF_PIXEL)
+    py = wp.int64(top * SUBPIXEL + HALF_PIXEL)
+    # Edge opposite to a, b, c at the first pixel centre; the bias moves centres on excluded edges out.
+    ea_row = dxa * (py - wp.int64(yb)) - dya * (px - wp.int64(xb))
+    eb_row = dxb * (py - wp.int64(yc)) - dyb * (px - wp.int64(xc))
+    ec_row = dxc * (py - wp.int64(ya)) - dyc * (px - wp.int64(xa))
+    bias_a = edge_bias(dxa, dya)
+    bias_b = edge_bias(dxb, dyb)
+    bias_c = edge_bias(dxc, dyc)
+    inv_area = 1.0 / float(area)
+    width = target.x1 - target.x0
+    for y in range(top, bottom + 1):
+        ea = ea_row
+        eb = eb_row
+        ec = ec_row
+        cell = (y - target.y0) * width - target.x0
+        for x in range(left, right + 1):
+            if ((ea + bias_a) | (eb + bias_b) | (ec + bias_c)) >= wp.int64(0):
+                depth_key = (float(ea) * a[2] + float(eb) * kb + float(ec) * kc) * inv_area
+                if depth_key > target.key_min:
+                    visible = bool(True)
+                    if target.mask_value > 0:
+                        visible = target.mask[y * target.mask_width + x] == target.mask_value
+                    if visible:
+                        wp.atomic_max(target.key, cell + x, pack_key(depth_key, triangle))
+            ea -= pixel_step(dya)
+            eb -= pixel_step(dyb)
+            ec -= pixel_step(dyc)
+        ea_row += pixel_step(dxa)
+        eb_row += pixel_step(dxb)
+        ec_row += pixel_step(dxc)
+
+
+@wp.func
+def clip_corner(target: TargetView, v: wp.vec4) -> wp.vec4:
+    """Homogeneous (X, Y, W, depth) of a projected vertex, see `layers.project`."""
+    if target.orthographic != 0:
+        return wp.vec4(v[0], v[1], 1.0, v[3])
+    if v[2] == 0.0:
+        return wp.vec4(v[0], v[1], v[3], v[3])
+    return wp.vec4(v[0] * v[3], v[1] * v[3], v[3], v[3])
+
+
+@wp.func
+def plane_distance(target: TargetView, plane: int, v: wp.vec4) -> float:
+    if plane == 0:
+        return v[3] - target.near
+    if plane == 1:
+        return v[0] + GUARD * v[2]
+    if plane == 2:
+        return GUARD * v[2] - v[0]
+    if plane == 3:
+        return v[1] + GUARD * v[2]
+    return GUARD * v[2] - v[1]
+
+
+@wp.func
+def screen_corner(target: TargetView, v: wp.vec4) -> wp.vec3:
+    if target.orthographic != 0:
+        return wp.vec3(v[0], v[1], 1.0 - v[3] / target.far)
+    inv = 1.0 / v[2]
+    return wp.vec3(v[0] * inv, v[1] * inv, inv)
+
+
+@wp.func
+def draw_clipped(target: TargetView, a: wp.vec4, b: wp.vec4, c: wp.vec4, triangle: int, row_first: int, row_end: int):
+    """Clip a triangle against the near plane and the guard band in homogeneous space, then draw it as a fan.
+
+    Each crossing is computed from the corner inside to the corner outside, so that two triangles with a common edge
+    get bit-equal points on it (Sutherland and Hodgman 1974, with that order fixed).
+    """
+    polygon = _polygon()
+    clipped = _polygon()
+    polygon[0] = clip_corner(target, a)
+    polygon[1] = clip_corner(target, b)
+    polygon[2] = clip_corner(target, c)
+    count = int(3)
+    for plane in range(5):
+        kept = int(0)
+        for i in range(count):
+            current = polygon[i]
+            following = polygon[(i + 1) % count]
+            d0 = plane_distance(target, plane, current)
+            d1 = plane_distance(target, plane, following)
+            if d0 >= 0.0 and kept < CLIP_VERTICES:
+                clipped[kept] = current
+                kept += 1
+            if (d0 >= 0.0) != (d1 >= 0.0) and kept < CLIP_VERTICES:
+                if d0 >= 0.0:
+                    clipped[kept] = current + (following - current) * (d0 / (d0 - d1))
+                else:
+                    clipped[kept] = following + (current - following) * (d1 / (d1 - d0))
+                kept += 1
+        count = kept
+        for i in range(count):
+            polygon[i] = clipped[i]
+    if count < 3:
+        return
+    corner = screen_corner(target, polygon[0])
+    for i in range(1, count - 1):
+        draw_triangle(
+            target,
+            corner,
+            screen_corner(target, polygon[i]),
+            screen_corner(target, polygon[i + 1]),
+            triangle,
+            row_first,
+            row_end,
+        )
+
+
+@wp.func
+def covers_centre(target: TargetView, a: wp.vec4, b: wp.vec4, c: wp.vec4) -> bool:
+    """False where the snapped bounding box of an unclipped triangle holds no pixel centre of the target."""
+    left = first_centre(snap(wp.min(a[0], wp.min(b[0], c[0]))))
+    right = last_centre(snap(wp.max(a[0], wp.max(b[0], c[0]))))
+    top = first_centre(snap(wp.min(a[1], wp.min(b[1], c[1]))))
+    bottom = last_centre(snap(wp.max(a[1], wp.max(b[1], c[1]))))
+    return (
+        wp.max(left, target.x0) <= wp.min(right, target.x1 - 1)
+        and wp.max(top, target.y0) <= wp.min(bottom, target.y1 - 1)
+    )
+
+
+@wp.kernel
+def cull_kernel(
+    first: int,
+    target: TargetView,
+    screen: wp.array(dtype=wp.vec4),
+    triangles: wp.array(dtype=wp.vec3i),
+    step: int,
+    out_survivors: wp.array(dtype=int),
+    out_survivor_count: wp.array(dtype=int),
+):
+    """One thread per triangle; each slice of `step` triangles compacts its survivors at its own start."""
+    i = first + wp.tid()
+    corners = triangles[i]
+    a = screen[corners[0]]
+    b = screen[corners[1]]
+    c = screen[corners[2]]
+    if a[2] < 0.0 or b[2] < 0.0 or c[2] < 0.0:
+        return
+    if needs_clipping(a) or needs_clipping(b) or needs_clipping(c):
+        if a[3] < target.near and b[3] < target.near and c[3] < target.near:
+            return
+    elif not covers_centre(target, a, b, c):
+        return
+    part = i / step
+    place = wp.atomic_add(out_survivor_count, part, 1)
+    out_survivors[part * step + place] = i
+
+
+@wp.kernel
+def draw_kernel(
+    first: int,
+    target: TargetView,
+    screen: wp.array(dtype=wp.vec4),
+    triangles: wp.array(dtype=wp.vec3i),
+    ids: wp.array(dtype=int),
+    id_offset: int,
+    step: int,
+    survivors: wp.array(dtype=int),
+    survivor_count: wp.array(dtype=int),
+    row_first: int,
+    row_end: int,
+):
+    """One thread per survivor of a slice; writes only rows [row_first, row_end)."""
+    i = first + wp.tid()
+    part = i / step
+    if i - part * step >= survivor_count[part]:
+        return
+    t = survivors[i]
+    corners = triangles[t]
+    a = screen[corners[0]]
+    b = screen[corners[1]]
+    c = screen[corners[2]]
+    triangle = t + id_offset
+    if ids.shape[0] > 0:
+        triangle = ids[t]
+    if needs_clipping(a) or needs_clipping(b) or needs_clipping(c):
+        draw_clipped(target, a, b, c, triangle, row_first, row_end)
+    else:
+        draw_triangle(
+            target,
+            wp.vec3(a[0], a[1], a[2]),
+            wp.vec3(b[0], b[1], b[2]),
+            wp.vec3(c[0], c[1], c[2]),
+            triangle,
+            row_first,
+            row_end,
+        )
+
+
+@wp.kernel
+def project_kernel(
+    first: int, points: wp.array(dtype=wp.vec3), camera: CameraView, out_screen: wp.array(dtype=wp.vec4)
+):
+    """One thread per vertex."""
+    i = first + wp.tid()
+    out_screen[i] = project(camera, points[i] - camera.eye)
+
+
+@wp.kernel
+def resolve_kernel(
+    first: int,
+    key: wp.array(dtype=wp.uint64),
+    out_triangle: wp.array(dtype=int),
+    out_depth_key: wp.array(dtype=float),
+):
+    """One thread per pixel."""
+    i = first + wp.tid()
+    k = key[i]
+    out_triangle[i] = key_triangle(k)
+    out_depth_key[i] = key_depth(k)
+
+
+def make_target(
+    camera: CameraView, box: tuple[int, int, int, int], device, mask: wp.array | None = None, mask_value: int = 0
+) -> Target:
+    """An empty z-buffer over a pixel box of a camera's image, drawn only where `mask` equals `mask_value` (if > 0)."""
+    x0, y0, x1, y1 = box
+    key = wp.zeros(max(x1 - x0, 0) * max(y1 - y0, 0), dtype=wp.uint64, device=device)
+    view = TargetView()
+    view.key = key
+    view.x0, view.y0, view.x1, view.y1 = box
+    view.mask = mask if mask is not None else wp.zeros(1, dtype=int, device=device)
+    view.mask_value = mask_value
+    view.mask_width = camera.width
+    view.key_min = 0.0 if camera.orthographic else 1.0 / camera.far
+    view.near = camera.near
+    view.far = camera.far
+    view.orthographic = camera.orthographic
+    return Target(view, key, box)
+
+
+def rasterise(
+    target: Target,
+    screen: wp.array,
+    triangles: wp.array,
+    *,
+    ids: wp.array | None = None,
+    threads: int = 0,
+) -> int:
+    """Draw triangles into a target; repeated calls accumulate.
+
+    Args:
+        target: Where to.
+        screen: vec4 per vertex as `layers.project` gives it; a key below 0 drops the vertex's triangles.
+        triangles: vec3i [triangle_count], indices into `screen`.
+        ids: int [triangle_count], what the z-buffer stores per triangle; None: the triangle's index.
+        threads: CPU threads.
+
+    Returns:
+        Triangles that survived the culling (0 on CUDA, where the count stays on the device).
+    """
+    count = len(triangles)
+    if count == 0 or len(target.key) == 0:
+        return 0
+    device = target.key.device
+    step = slice_length(count, device, threads)
+    slice_count = -(-count // step)
+    survivors = wp.empty(count, dtype=int, device=device)
+    survivor_count = wp.zeros(slice_count, dtype=int, device=device)
+    launch(
+        cull_kernel, count, [target.view, screen, triangles, step, survivors, survivor_count], device, threads
+    )
+    if ids is None:
+        ids = wp.empty(0, dtype=int, device=device)
+    inputs = [target.view, screen, triangles, ids, 0, step, survivors, survivor_count]
+    if device.is_cuda:
+        launch_bands(draw_kernel, [(0, count)], [(target.box[1], target.box[3])], inputs, device)
+        return 0
+    counts = survivor_count.numpy()
+    ranges = [(k * step, int(n)) for k, n in enumerate(counts) if n > 0]
+    bands = row_bands(target.box[1], target.box[3], slice_count)
+    launch_bands(draw_kernel, ranges, bands, inputs, device)
+    return int(counts.sum())
+
+
+def row_bands(first: int, end: int, count: int) -> list[tuple[int, int]]:
+    """Rows [first, end) in at most `count` contiguous, non-empty bands."""
+    edges = np.unique(np.linspace(first, end, max(count, 1) + 1).astype(int))
+    return list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
+
+
+def draw_scene(scene: Scene, camera: Camera, threads: int = 0) -> GBuffer:
+    """The eye view of a scene: per pixel the nearest triangle and its depth key."""
+    device = scene.device
+    view = camera.view(scene)
+    width, height = camera.size
+    target = make_target(view, (0, 0, width, height), device)
+    screen = wp.empty(scene.vertex_count, dtype=wp.vec4, device=device)
+    launch(project_kernel, scene.vertex_count, [scene.view.points, view, screen], device, threads)
+    rasterise(target, screen, scene.view.triangles, threads=threads)
+    triangle = wp.empty(width * height, dtype=int, device=device)
+    depth_key = wp.empty(width * height, dtype=float, device=device)
+    launch(resolve_kernel, width * height, [target.key, triangle, depth_key], device, threads)
+    return GBuffer(camera, view, triangle, depth_key)
