@@ -1,0 +1,448 @@
+"""Images in and out: the only user of OpenImageIO.
+
+Arrays are `[height, width]` or `[height, width, channels]`, row 0 at the top, linear Rec.709 unless said otherwise.
+A file appears under its final name whole or not at all.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+from collections.abc import Collection, Mapping
+from itertools import count
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+FORMATS = {".exr": "openexr", ".png": "png"}  # JPEG is left out: its writer ends the process on a full disk
+COLOR_CHANNELS = frozenset(
+    {"R", "G", "B", "A", "RGB", "RGBA", "reflection"}
+)  # half in an EXR; all else is data
+HALF_MAX = 65504.0  # largest finite half
+SIZE_LIMIT_MB = 512  # decoded size above which a picture is refused: a 1 MB file can ask for 4 GB
+FRAME_LIMIT_MB = 8192  # the same for our own frames: 8K with every channel
+SIDE_LIMIT = 32768  # pixels
+
+REC709_PRIMARIES = (
+    0.64,
+    0.33,
+    0.30,
+    0.60,
+    0.15,
+    0.06,
+    0.3127,
+    0.3290,
+)  # x y of red, green, blue, white (ITU-R BT.709)
+# Primaries of the named spaces that files declare (ACES: SMPTE ST 2065-1 and S-2014-004; P3: SMPTE EG 432-1).
+NAMED_PRIMARIES = {
+    "lin_ap1_scene": (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767),
+    "lin_ap0_scene": (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.0770, 0.32168, 0.33767),
+    "lin_p3d65_scene": (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.3127, 0.3290),
+    "lin_rec2020_scene": (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, 0.3127, 0.3290),
+}
+NAMED_PRIMARIES["acescg"] = NAMED_PRIMARIES["lin_ap1_scene"]
+NAMED_PRIMARIES["aces2065-1"] = NAMED_PRIMARIES["lin_ap0_scene"]
+BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
+
+_part_number = count()
+
+
+class Picture(NamedTuple):
+    """A picture that was read, ready to shade with."""
+
+    rgb: np.ndarray
+    """float32 [height, width, 3], finite and >= 0; linear Rec.709, or as stored where `color_space` was "raw"."""
+    cleaned: int
+    """Samples that were NaN, infinite or negative and were replaced."""
+    alpha: np.ndarray | None = None
+    """float32 [height, width] in [0, 1], where the file has one."""
+
+
+def linear_from_srgb(encoded: np.ndarray) -> np.ndarray:
+    """Linear light of sRGB-encoded values, any shape (IEC 61966-2-1)."""
+    encoded = np.asarray(encoded, np.float32)
+    high = ((np.maximum(encoded, 0.04045) + np.float32(0.055)) / np.float32(1.055)) ** np.float32(2.4)
+    return np.where(encoded <= 0.04045, encoded / np.float32(12.92), high)
+
+
+def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
+    """SRGB encoding of linear light, any shape, not clipped (IEC 61966-2-1)."""
+    linear = np.asarray(linear, np.float32)
+    high = np.float32(1.055) * np.maximum(linear, 0.0031308) ** np.float32(1.0 / 2.4) - np.float32(0.055)
+    return np.where(linear <= 0.0031308, linear * np.float32(12.92), high)
+
+
+def rec709_from_primaries(primaries) -> np.ndarray:
+    """Matrix [3, 3] from linear RGB of the given primaries to linear Rec.709, acting on columns.
+
+    Args:
+        primaries: x and y of red, green, blue and white, [8] (OpenEXR's `chromaticities`).
+
+    Source: SMPTE RP 177 (primaries to XYZ), Bradford adaptation between the whites.
+    """
+    source, target = _xyz_from_primaries(primaries), _xyz_from_primaries(REC709_PRIMARIES)
+    cone_from = BRADFORD @ source.sum(axis=1)
+    cone_to = BRADFORD @ target.sum(axis=1)
+    adapt = np.linalg.inv(BRADFORD) @ np.diag(cone_to / cone_from) @ BRADFORD
+    return np.linalg.inv(target) @ adapt @ source
+
+
+def _xyz_from_primaries(primaries) -> np.ndarray:
+    xy = np.asarray(primaries, np.float64).reshape(4, 2)
+    xyz = np.stack([xy[:, 0], xy[:, 1], 1.0 - xy.sum(axis=1)])
+    white = xyz[:, 3] / xyz[1, 3]
+    return xyz[:, :3] * np.linalg.solve(xyz[:, :3], white)
+
+
+def check_writable(path: str | os.PathLike) -> Path:
+    """Refuse, before any work is done, an output that could not be written.
+
+    Raises:
+        ValueError: an unknown extension.
+        OSError: the folder is missing, is no folder or is read-only, or the name cannot be used.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in FORMATS:
+        raise ValueError(f"{path}: cannot write a '{path.suffix}' image; use {' or '.join(FORMATS)}")
+    try:
+        mode = os.stat(path).st_mode
+    except FileNotFoundError:
+        mode = stat.S_IFREG
+    except OSError as error:
+        raise OSError(f"{path}: cannot be written: {error.strerror}") from None
+    if not stat.S_ISREG(mode):
+        raise OSError(f"{path}: cannot be written: it exists and is not a regular file")
+    folder = path.parent
+    if not folder.is_dir():
+        raise OSError(f"{path}: cannot be written: the folder '{folder}' does not exist; make it first")
+    probe = _part_name(path)
+    try:
+        # A permission bit says little (root, read-only mounts): make a file.
+        os.close(os.open(probe, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
+        os.unlink(probe)
+    except OSError as error:
+        raise OSError(f"{path}: cannot be written: {error.strerror}") from None
+    return path
+
+
+def write_exr(
+    path: str | os.PathLike,
+    channels: Mapping[str, np.ndarray],
+    half: Collection[str] = COLOR_CHANNELS,
+    attributes: Mapping[str, object] | None = None,
+) -> int:
+    """Write a one-part EXR, ZIP-compressed, half or float32 per channel.
+
+    Args:
+        path: Where; the format is EXR whatever the extension.
+        channels: Name to array [height, width] or [height, width, n]. n components become `name.X .Y .Z`, or
+            `name.R .G .B .A` where the name is in `half`; "RGB" and "RGBA" become their letters.
+        half: Names stored as half, clamped to +-65504; the others are float32.
+        attributes: Header entries. str, int and float as they are; anything else as JSON (OpenEXR through OIIO keeps
+            no float64: a JSON list does).
+
+    Returns:
+        Samples that were NaN or infinite and were replaced: in a half channel by 0 or +-65504, in a data channel by 0.
+
+    Raises:
+        ValueError: no channel, or shapes that differ.
+        OSError: the file could not be written; nothing is left under the name, and an older file there is whole.
+    """
+    import OpenImageIO as oiio
+
+    names, planes, halves = [], [], []
+    for name, array in channels.items():
+        array = np.asarray(array)
+        if array.ndim not in (2, 3):
+            raise ValueError(
+                f"channel '{name}': got shape {array.shape}, expected [height, width] or [.., .., n]"
+            )
+        for suffix, plane in _split(name, array, name in half):
+            names.append(suffix)
+            planes.append(plane)
+            halves.append(name in half)
+    if not planes or 0 in planes[0].shape:
+        raise ValueError(f"{path}: an image needs at least one channel and one pixel")
+    height, width = planes[0].shape
+    pixels = np.empty((height, width, len(planes)), np.float32)
+    replaced = 0
+    for k, (name, plane) in enumerate(zip(names, planes, strict=True)):
+        if plane.shape != (height, width):
+            raise ValueError(
+                f"channel '{name}': got shape {plane.shape}, expected {(height, width)} as the first"
+            )
+        with np.errstate(over="ignore"):
+            values = plane.astype(np.float32)
+        good = np.isfinite(values)
+        if not good.all():
+            replaced += int(good.size - np.count_nonzero(good))
+            limit = HALF_MAX if halves[k] else 0.0
+            values = np.nan_to_num(values, nan=0.0, posinf=limit, neginf=-limit)
+        pixels[..., k] = np.clip(values, -HALF_MAX, HALF_MAX) if halves[k] else values
+    spec = oiio.ImageSpec(width, height, len(planes), oiio.FLOAT)
+    spec.channelnames = names
+    spec.channelformats = tuple(oiio.TypeDesc("half" if is_half else "float") for is_half in halves)
+    spec.attribute("compression", "zip")
+    spec.attribute("oiio:ColorSpace", "lin_rec709_scene")
+    spec.attribute("DateTime", "")  # the same frame is the same file
+    for name, value in (attributes or {}).items():
+        plain = isinstance(value, str | int | float) and not isinstance(value, bool)
+        spec.attribute(name, value if plain else json.dumps(_jsonable(value)))
+    _write_whole(Path(path), "openexr", spec, pixels)
+    return replaced
+
+
+def write_png(path: str | os.PathLike, rgb: np.ndarray) -> int:
+    """Write linear colour as an 8-bit sRGB PNG (exposure 0, clipped to [0, 1]).
+
+    Args:
+        path: Where.
+        rgb: Linear Rec.709, [height, width, 3 or 4] (straight alpha) or [height, width] (grey).
+
+    Returns:
+        Samples that were NaN or infinite and were replaced by 0 or 1.
+
+    Raises:
+        ValueError: another shape.
+        OSError: as `write_exr`.
+    """
+    import OpenImageIO as oiio
+
+    rgb = np.asarray(rgb)
+    if rgb.ndim == 2:
+        rgb = rgb[..., None]
+    if rgb.ndim != 3 or rgb.shape[2] not in (1, 3, 4) or 0 in rgb.shape:
+        raise ValueError(f"{path}: got an array of shape {rgb.shape}, expected [height, width, 1, 3 or 4]")
+    with np.errstate(over="ignore"):
+        values = rgb.astype(np.float32)
+    replaced = int(values.size - np.count_nonzero(np.isfinite(values)))
+    values = np.clip(np.nan_to_num(values, nan=0.0, posinf=1.0, neginf=0.0), 0.0, 1.0)
+    values[..., :3] = srgb_from_linear(values[..., :3])
+    pixels = np.floor(values * 255.0 + 0.5).astype(np.uint8)
+    height, width, channel_count = pixels.shape
+    spec = oiio.ImageSpec(width, height, channel_count, oiio.UINT8)
+    spec.attribute("oiio:ColorSpace", "srgb_rec709_scene")
+    spec.attribute("oiio:UnassociatedAlpha", 1)
+    spec.attribute("DateTime", "")
+    _write_whole(Path(path), "png", spec, pixels)
+    return replaced
+
+
+def read_exr(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict[str, object]]:
+    """Read the channels of a frame back, whatever their order in the file.
+
+    Returns:
+        (channels, attributes). `name.X .Y (.Z)` and `name.R .G .B (.A)` come back as one float32 array
+        [height, width, 2..4] under `name`; every other channel as [height, width]. Attributes that hold a JSON list
+        or object come back as such.
+
+    Raises:
+        OSError: no such file, not a regular file, or not whole.
+    """
+    pixels, spec = _read(Path(path), FRAME_LIMIT_MB)
+    flat = {name: pixels[..., k] for k, name in enumerate(spec.channelnames)}
+    channels: dict[str, np.ndarray] = {}
+    for name in flat:
+        stem, dot, suffix = name.rpartition(".")
+        for letters in ("XYZ", "XY", "RGBA", "RGB"):
+            group = [f"{stem}.{letter}" for letter in letters]
+            if dot and suffix in letters and all(member in flat for member in group):
+                if stem not in channels:
+                    channels[stem] = np.stack([flat[member] for member in group], axis=-1)
+                break
+        else:
+            channels[name] = np.ascontiguousarray(flat[name])
+    return channels, {item.name: _parsed(item.value) for item in spec.extra_attribs}
+
+
+def read_image(
+    path: str | os.PathLike, color_space: str = "auto", size_limit_mb: int = SIZE_LIMIT_MB
+) -> Picture:
+    """Read a texture or an environment map.
+
+    Args:
+        path: Any format OpenImageIO reads; told apart by content.
+        color_space: "auto", "sRGB" or "raw", as UsdUVTexture's `sourceColorSpace`: auto decodes 8-bit pictures of 3 or
+            4 channels as sRGB, and converts float pictures that declare other primaries (ACEScg ...) to Rec.709.
+        size_limit_mb: Decoded size above which the file is refused. [MB]
+
+    Raises:
+        ValueError: an unknown `color_space`.
+        OSError: no such file, not a regular file, too large, or not whole; the text names the file.
+    """
+    if color_space not in ("auto", "sRGB", "raw"):
+        raise ValueError(f"color_space: got '{color_space}', expected auto, sRGB or raw")
+    path = Path(path)
+    pixels, spec = _read(path, size_limit_mb)
+    names = [name.upper() for name in spec.channelnames]
+    if not set("RGB") <= set(names):
+        # A layered file without a main picture: its first layer that has all three.
+        names = [name.rpartition(".")[2] for name in names]
+    color = [names.index(letter) for letter in "RGB" if letter in names]
+    if len(color) != 3:
+        color = [names.index("Y")] * 3 if "Y" in names else [color[0] if color else 0] * 3
+    rgb = np.ascontiguousarray(pixels[..., color])
+    alpha = np.ascontiguousarray(pixels[..., names.index("A")]) if "A" in names else None
+    bad = ~(rgb >= 0.0) | (rgb > np.finfo(np.float32).max)
+    distinct = bad if len(set(color)) == 3 else bad[..., :1]
+    cleaned = int(np.count_nonzero(distinct))
+    if cleaned:
+        rgb[bad] = 0.0
+    eight_bit = spec.format.size() == 1
+    if color_space == "sRGB" or (color_space == "auto" and eight_bit and len(set(color)) == 3):
+        rgb = linear_from_srgb(rgb)
+    elif color_space == "auto" and spec.format.basetype in _float_types():
+        primaries = _declared_primaries(spec)
+        if primaries is not None:
+            converted = rgb @ rec709_from_primaries(primaries).T.astype(np.float32)
+            # Colours outside Rec.709 get a negative component; there is no negative light to reflect.
+            rgb = np.maximum(converted, np.float32(0.0))
+    if alpha is not None:
+        alpha = np.clip(np.nan_to_num(alpha, nan=0.0, posinf=1.0, neginf=0.0), 0.0, 1.0)
+    return Picture(rgb.astype(np.float32, copy=False), cleaned, alpha)
+
+
+def _float_types() -> tuple:
+    import OpenImageIO as oiio
+
+    return oiio.HALF, oiio.FLOAT, oiio.DOUBLE
+
+
+def _declared_primaries(spec):
+    """The primaries a float picture declares, None for Rec.709 or nothing."""
+    declared = spec.getattribute("chromaticities")
+    if declared is None or len(declared) != 8:
+        declared = NAMED_PRIMARIES.get(spec.get_string_attribute("oiio:ColorSpace").lower())
+    if declared is None or np.allclose(
+        declared, REC709_PRIMARIES, atol=1e-3
+    ):  # 3 digits are what files write
+        return None
+    triangle = np.asarray(declared, float)[:6].reshape(3, 2)
+    edges = triangle[1:] - triangle[0]
+    area = abs(edges[0, 0] * edges[1, 1] - edges[0, 1] * edges[1, 0])
+    # Nonsense in a header is no reason to lose the picture.
+    return declared if np.isfinite(area) and area > 1e-3 and declared[7] > 1e-3 else None
+
+
+def _split(name: str, array: np.ndarray, is_color: bool) -> list[tuple[str, np.ndarray]]:
+    if array.ndim == 2:
+        return [(name, array)]
+    components = array.shape[2]
+    if name in ("RGB", "RGBA"):
+        letters, prefix = name, ""
+    else:
+        letters, prefix = ("RGBA" if is_color else "XYZW"), f"{name}."
+    if components > len(letters):
+        raise ValueError(f"channel '{name}': got {components} components, expected at most {len(letters)}")
+    return [(prefix + letters[k], array[..., k]) for k in range(components)]
+
+
+def _jsonable(value):
+    if isinstance(value, Mapping):
+        return {str(key): _jsonable(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_jsonable(item) for item in value]
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+
+
+def _parsed(value):
+    if isinstance(value, str) and value[:1] in ("[", "{"):
+        try:
+            return json.loads(value)
+        except ValueError:
+            return value
+    return value
+
+
+def _part_name(path: Path) -> Path:
+    return path.parent / f".{os.getpid()}-{next(_part_number)}.part"
+
+
+def _write_whole(path: Path, format_name: str, spec, pixels: np.ndarray) -> None:
+    """Write under a passing name, read the last row back, and rename: a reader never meets half a file.
+
+    The PNG writer returns success on a full disk and only `geterror` tells; a cut EXR keeps a valid header.
+    """
+    import OpenImageIO as oiio
+
+    # A link stays a link: what it points at is replaced.
+    final = Path(os.path.realpath(path))
+    part = _part_name(final)
+    try:
+        output = oiio.ImageOutput.create(format_name)
+        good = output.open(str(part), spec)
+        if good:
+            good = output.write_image(pixels)
+            good = output.close() and good
+        message = output.geterror()
+        del output
+        if not good or message:
+            raise OSError(f"{path}: cannot be written: {_one_line(message, part) or 'the writer failed'}")
+        _check_last_row(path, part, spec)
+        with open(part, "rb") as file:
+            os.fsync(file.fileno())
+        os.replace(part, final)
+        _sync_folder(final.parent)
+    except OSError as error:
+        if error.errno is None:
+            raise
+        raise OSError(error.errno, f"{path}: cannot be written: {os.strerror(error.errno)}") from None
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _check_last_row(path: Path, part: Path, spec) -> None:
+    import OpenImageIO as oiio
+
+    reader = oiio.ImageInput.open(str(part))
+    row = reader.read_scanline(spec.height - 1, 0, oiio.UNKNOWN) if reader else None
+    message = reader.geterror() if reader else oiio.geterror()
+    if row is None or message:
+        raise OSError(f"{path}: cannot be written: the file came out cut (is the disk full?)")
+    reader.close()
+
+
+def _sync_folder(folder: Path) -> None:
+    if not hasattr(os, "O_DIRECTORY"):
+        return  # Windows cannot open a folder
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _one_line(message: str, part: Path | None = None) -> str:
+    """First line of a library's text, without the passing name."""
+    line = message.strip().splitlines()[0] if message.strip() else ""
+    return line if part is None else line.replace(str(part), "the file")
+
+
+def _read(path: Path, size_limit_mb: int):
+    """(float32 [height, width, channels], spec) of a file's first part."""
+    import OpenImageIO as oiio
+
+    try:
+        # A pipe would block for ever.
+        if not stat.S_ISREG(os.stat(path).st_mode):
+            raise OSError(f"{path}: cannot be read: not a regular file")
+    except FileNotFoundError:
+        raise FileNotFoundError(f"{path}: cannot be read: no such file") from None
+    oiio.attribute("limits:imagesize_MB", int(size_limit_mb))
+    oiio.attribute("limits:resolution", SIDE_LIMIT)
+    reader = oiio.ImageInput.open(str(path))
+    if reader is None:
+        raise OSError(f"{path}: cannot be read: {_one_line(oiio.geterror()) or 'no reader knows it'}")
+    spec = reader.spec()
+    pixels = reader.read_image(oiio.FLOAT)
+    # A cut JPEG and a bad EXR chunk "succeed"; only the text says that the rest is grey.
+    message = reader.geterror()
+    reader.close()
+    if pixels is None or message:
+        raise OSError(f"{path}: cannot be read: {_one_line(message) or 'the file is damaged'}")
+    pixels = np.asarray(pixels, np.float32)
+    if pixels.ndim == 2:
+        pixels = pixels[..., None]
+    return pixels, spec

@@ -1,0 +1,50 @@
+"""Wall-clock time per named stage of a frame."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from time import perf_counter
+
+import warp as wp
+
+
+class StageTimer:
+    """Adds up the time spent in named stages, in the order they were first entered.
+
+    `with timer("raster"): ...` counts everything launched inside: on CUDA the device is waited for at both ends (on
+    the CPU a launch returns when it is done). A stage opened inside another is named after it: "search" inside
+    "reflect" is "reflect/search", and counts towards both. For one thread at a time.
+
+    Attributes:
+        ms: Stage name to milliseconds.
+    """
+
+    def __init__(self, device: wp.DeviceLike = "cpu"):
+        self.ms: dict[str, float] = {}
+        self._device = wp.get_device(device)
+        self._open: list[str] = []
+
+    @contextmanager
+    def __call__(self, name: str) -> Iterator[None]:
+        parent = self._open[-1] + "/" if self._open else ""
+        full = name if name.startswith(parent) else parent + name
+        self.ms.setdefault(full, 0.0)
+        self._open.append(full)
+        self._wait()
+        start = perf_counter()
+        try:
+            yield
+            self._wait()
+        finally:
+            self.ms[full] += 1000.0 * (perf_counter() - start)
+            self._open.pop()
+
+    @property
+    def total_ms(self) -> float:
+        """Time in all outermost stages. [ms]"""
+        return sum(ms for name, ms in self.ms.items() if "/" not in name)
+
+    def _wait(self) -> None:
+        if self._device.is_cuda:
+            wp.synchronize_device(self._device)
