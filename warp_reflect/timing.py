@@ -12,9 +12,9 @@ import warp as wp
 class StageTimer:
     """Adds up the time spent in named stages, in the order they were first entered.
 
-    `with timer("raster"): ...` counts everything launched inside: on CUDA the device is waited for at both ends (on
-    the CPU a launch returns when it is done). A stage opened inside another is named after it: "search" inside
-    "reflect" is "reflect/search", and counts towards both. For one thread at a time.
+    `with timer("raster"): ...` counts everything launched inside: on CUDA the device is waited for at both
+    ends (on the CPU a launch returns when it is done). A stage opened inside another is named after it:
+    "search" inside "reflect" is "reflect/search", and counts towards both. For one thread at a time.
 
     Attributes:
         ms: Stage name to milliseconds.
@@ -42,7 +42,7 @@ class StageTimer:
 
     @property
     def total_ms(self) -> float:
-        """Time in all outermost stages. [ms]"""
+        """Time in all outermost stages [ms]."""
         return sum(ms for name, ms in self.ms.items() if "/" not in name)
 
     def _wait(self) -> None:
