@@ -16,6 +16,7 @@ from functools import cache, partial
 import warp as wp
 
 SPLIT_MIN = 4096  # elements below which the hand-off (20-60 us) costs more than the second thread saves
+CPU_BLOCK_DIM = 1  # what Warp launches with on the CPU
 SLICE_ALIGN = 64  # elements; slices that share a cache line of 4-byte results would ping-pong it
 
 
@@ -83,8 +84,11 @@ def launch_bands(kernel, ranges: list[tuple[int, int]], bands: list[tuple[int, i
 
 
 def _load(kernel, device) -> None:
-    # The module must be compiled and loaded before threads race for it.
-    kernel.module.load(wp.get_device(device))
+    # The module must be compiled and loaded before threads race for it. With the block size of a CPU launch: it is
+    # part of the module's identity, and another one would compile everything a second time.
+    device = wp.get_device(device)
+    if device.is_cpu:
+        kernel.module.load(device, CPU_BLOCK_DIM)
 
 
 def run_parallel(jobs: list) -> None:

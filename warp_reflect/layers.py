@@ -172,12 +172,14 @@ class GBuffer:
     Attributes:
         triangle: int32 [height * width], -1 background.
         depth_key: float32 [height * width], see `project`; 0 background.
+        reflector_id: int32 [height * width], 1-based id of the mirror seen, 0 none; set once the plan is known.
     """
 
     camera: Camera
     view: CameraView
     triangle: wp.array
     depth_key: wp.array
+    reflector_id: wp.array | None = None
 
 
 @dataclass
@@ -205,6 +207,21 @@ class MirrorPixels:
         return len(self.pixel)
 
 
+@dataclass(frozen=True)
+class Reflector:
+    """A mirror as the techniques see it.
+
+    Attributes:
+        id: 1-based, the `reflectorId` channel.
+        part: Index into `Scene.parts`.
+        convex: Its body is proven convex: its own triangles are never seen in it.
+    """
+
+    id: int
+    part: int
+    convex: bool
+
+
 @dataclass
 class ReflectionLayer:
     """The common answer of every technique for the pixels of one reflector, in the order of its `MirrorPixels`.
@@ -217,6 +234,7 @@ class ReflectionLayer:
         distance: float32 [n], from P to the hit along the reflected direction. [scene units]
         status: uint8 [n], `Status`.
         statistics: Counts of who settled the pixels, and of what the search met.
+        timings: Milliseconds per step.
         history: What the next frame may start from.
     """
 
@@ -228,6 +246,7 @@ class ReflectionLayer:
     distance: wp.array
     status: wp.array
     statistics: dict = field(default_factory=dict)
+    timings: dict = field(default_factory=dict)
     history: object = None
 
     @classmethod

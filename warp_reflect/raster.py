@@ -395,6 +395,7 @@ def rasterise(
     triangles: wp.array,
     *,
     ids: wp.array | None = None,
+    id_offset: int = 0,
     threads: int = 0,
 ) -> int:
     """Draw triangles into a target; repeated calls accumulate.
@@ -403,7 +404,8 @@ def rasterise(
         target: Where to.
         screen: vec4 per vertex as `layers.project` gives it; a key below 0 drops the vertex's triangles.
         triangles: vec3i [triangle_count], indices into `screen`.
-        ids: int [triangle_count], what the z-buffer stores per triangle; None: the triangle's index.
+        ids: int [triangle_count], what the z-buffer stores per triangle; None: the triangle's index + id_offset.
+        id_offset: See `ids`.
         threads: CPU threads.
 
     Returns:
@@ -422,7 +424,7 @@ def rasterise(
     )
     if ids is None:
         ids = wp.empty(0, dtype=int, device=device)
-    inputs = [target.view, screen, triangles, ids, 0, step, survivors, survivor_count]
+    inputs = [target.view, screen, triangles, ids, id_offset, step, survivors, survivor_count]
     if device.is_cuda:
         launch_bands(draw_kernel, [(0, count)], [(target.box[1], target.box[3])], inputs, device)
         return 0

@@ -67,7 +67,7 @@ class Settings:
     search: str = "newton"
     """`newton` (the default) or `midpoint`, the search of Estalella et al. 2005, section 4.3."""
     iterations: int = 0
-    """Bound on the search's map evaluations per vertex; 0: the search's own default."""
+    """Bound on the steps of a search per vertex; 0: the search's own default (newton 12, midpoint 9)."""
     tolerance: float = 0.0
     """Residual sine at which a search stops; 0: 0.1 h^2 of the map's texel size h (below that the map is wrong)."""
     map_resolution: int = 128

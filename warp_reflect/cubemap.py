@@ -1,0 +1,79 @@
+"""Direction <-> cube face, for node-centred cube maps.
+
+A direction x with max |x_i| = 1 lies on face 2 k + (x_k < 0) of the major axis k, at u = x[k+1] / |x_k|,
+v = x[k+2] / |x_k| (indices modulo 3). Nodes lie at u_i = -1 + 2 i / (n - 1): nodes on an edge of the cube belong to
+both faces, so bilinear interpolation is continuous across faces without gutters. Texel (face, j, i) of a map of n
+nodes is element (face n + j) n + i.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+FACE_COUNT = 6
+
+
+@wp.struct
+class CubePoint:
+    """A point on the cube: face 0-5, position in [-1, 1]^2."""
+
+    face: int
+    u: float
+    v: float
+
+
+@wp.func
+def max_abs(x: wp.vec3) -> float:
+    return wp.max(wp.abs(x[0]), wp.max(wp.abs(x[1]), wp.abs(x[2])))
+
+
+@wp.func
+def project_to_cube(x: wp.vec3) -> wp.vec3:
+    """The point of the cube surface in direction x; +x for a zero vector."""
+    m = max_abs(x)
+    if m == 0.0:
+        return wp.vec3(1.0, 0.0, 0.0)
+    return x / m
+
+
+@wp.func
+def cube_point(x: wp.vec3) -> CubePoint:
+    """Face and position of a direction (any length but zero)."""
+    point = CubePoint()
+    ax = wp.abs(x[0])
+    ay = wp.abs(x[1])
+    az = wp.abs(x[2])
+    if ax >= ay and ax >= az:
+        point.face = wp.where(x[0] < 0.0, 1, 0)
+        point.u = x[1] / ax
+        point.v = x[2] / ax
+    elif ay >= az:
+        point.face = wp.where(x[1] < 0.0, 3, 2)
+        point.u = x[2] / ay
+        point.v = x[0] / ay
+    else:
+        point.face = wp.where(x[2] < 0.0, 5, 4)
+        point.u = x[0] / az
+        point.v = x[1] / az
+    return point
+
+
+def face_axes(face: int) -> tuple[int, int, int, float]:
+    """(k, axis of u, axis of v, sign of x_k) of a face."""
+    k = face // 2
+    return k, (k + 1) % 3, (k + 2) % 3, -1.0 if face % 2 else 1.0
+
+
+def node_directions(resolution: int) -> np.ndarray:
+    """The cube point of every node, float64 [6, n, n, 3] (face, row v, column u)."""
+    line = np.linspace(-1.0, 1.0, resolution)
+    result = np.empty((FACE_COUNT, resolution, resolution, 3))
+    for face in range(FACE_COUNT):
+        k, ku, kv, sign = face_axes(face)
+        result[face, :, :, k] = sign
+        result[face, :, :, ku] = line[None, :]
+        result[face, :, :, kv] = line[:, None]
+    return result

@@ -1,0 +1,329 @@
+"""The one pass of every forward technique: solve vertices -> virtual mesh -> rasterise -> refine.
+
+A technique supplies the solver; this module owns the virtual vertex, the clipping of triangles at the hidden boundary,
+the masked drawing and the hand-over to `refine`. Source of virtual objects: Diefenbach and Badler 1997 for planes,
+Ofek and Rappoport 1998 and Estalella et al. 2005 for curved mirrors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from warp_reflect import bvh, raster
+from warp_reflect.launch import launch
+from warp_reflect.layers import (
+    Camera,
+    CameraView,
+    GBuffer,
+    MirrorPixels,
+    ReflectionLayer,
+    Reflector,
+    project,
+)
+from warp_reflect.optics import virtual_point
+from warp_reflect.scene import Scene, SceneView
+from warp_reflect.settings import Settings, Status
+from warp_reflect.shapes import clamp_weights, intersect_triangle
+from warp_reflect.techniques import refine
+from warp_reflect.timing import StageTimer
+
+wp.set_module_options({"enable_backward": False})
+
+CONVERGED = wp.constant(int(Status.CONVERGED))
+HIDDEN = wp.constant(int(Status.HIDDEN))
+MAX_ITERATIONS = wp.constant(int(Status.MAX_ITERATIONS))
+SKY = wp.constant(int(Status.SKY))
+BOUNDARY_STEPS = 12  # bisections of an edge at the hidden boundary: 1/4096 of its length, below a pixel
+
+
+@wp.struct
+class SolveFrame:
+    """The unit frame of a reflector (a similarity of the scene frame) and the eye in it."""
+
+    unit_from_scene: wp.mat33
+    unit_offset: wp.vec3
+    eye_from_unit: wp.mat33  # of differences: eye-frame point = eye_from_unit (q - eye)
+    eye: wp.vec3
+
+
+@wp.struct
+class VertexView:
+    """Per scene vertex: where its virtual vertex appears (`layers.project`; key -1: nowhere), and how it was found."""
+
+    screen: wp.array(dtype=wp.vec4)
+    status: wp.array(dtype=wp.uint8)
+    seed: wp.array(dtype=wp.vec3)  # what a warm start begins from; zero: nothing known
+    residual: wp.array(dtype=float)
+
+
+@dataclass
+class History:
+    """What the next frame's search of a reflector may start from."""
+
+    seed: wp.array
+
+
+@wp.func
+def finish_vertex(frame: SolveFrame, camera: CameraView, p: wp.vec3, n: wp.vec3, target: wp.vec3) -> wp.vec4:
+    """Project the virtual vertex of a reflection point (unit frame)."""
+    # Curvature of a body of the map's size: it only picks the form that forgives an error of p more.
+    curvature = 1.0 / wp.max(wp.length(p), 1.0e-6)
+    q = virtual_point(p, n, frame.eye, target, curvature)
+    return project(camera, frame.eye_from_unit * (q - frame.eye))
+
+
+@wp.kernel
+def straddle_kernel(
+    first: int,
+    triangles: wp.array(dtype=wp.vec3i),
+    status: wp.array(dtype=wp.uint8),
+    out_kind: wp.array(dtype=wp.uint8),
+):
+    """One thread per triangle: 1 if it straddles the hidden boundary, 2 if a corner's search failed, else 0."""
+    i = first + wp.tid()
+    t = triangles[i]
+    hidden = int(0)
+    solved = int(0)
+    failed = int(0)
+    for k in range(3):
+        s = int(status[t[k]])
+        if s == HIDDEN:
+            hidden += 1
+        elif s == CONVERGED:
+            solved += 1
+        elif s == MAX_ITERATIONS:
+            failed += 1
+    kind = int(0)
+    if failed > 0:
+        kind = 2
+    elif hidden > 0 and solved > 0:
+        kind = 1
+    out_kind[i] = wp.uint8(kind)
+
+
+@wp.kernel
+def project_points_kernel(
+    first: int, points: wp.array(dtype=wp.vec3), camera: CameraView, out_screen: wp.array(dtype=wp.vec4)
+):
+    """One thread per eye-frame point."""
+    i = first + wp.tid()
+    out_screen[i] = project(camera, points[i])
+
+
+@wp.kernel
+def candidate_hits_kernel(
+    first: int,
+    scene: SceneView,
+    camera: CameraView,
+    target: raster.TargetView,
+    screen: wp.array(dtype=wp.vec4),
+    # Mirror pixels:
+    pixel: wp.array(dtype=int),
+    point: wp.array(dtype=wp.vec3),
+    direction: wp.array(dtype=wp.vec3),
+    # Outputs:
+    out_triangle: wp.array(dtype=int),
+    out_u: wp.array(dtype=float),
+    out_v: wp.array(dtype=float),
+    out_distance: wp.array(dtype=float),
+    out_status: wp.array(dtype=wp.uint8),
+):
+    """One thread per mirror pixel: the point of the virtual triangle drawn there, without refinement."""
+    i = first + wp.tid()
+    x = pixel[i] % camera.width
+    y = pixel[i] / camera.width
+    cell = (y - target.y0) * (target.x1 - target.x0) + x - target.x0
+    triangle = raster.key_triangle(target.key[cell])
+    if triangle < 0:
+        out_status[i] = wp.uint8(SKY)
+        return
+    t = scene.triangles[triangle]
+    v0 = scene.points[t[0]]
+    v1 = scene.points[t[1]]
+    v2 = scene.points[t[2]]
+    a = screen[t[0]]
+    b = screen[t[1]]
+    c = screen[t[2]]
+    weights = wp.vec2(0.0, 0.0)
+    if a[2] > 0.0 and b[2] > 0.0 and c[2] > 0.0:
+        px = float(x) + 0.5
+        py = float(y) + 0.5
+        # Screen weights times the depth keys are perspective-correct weights.
+        wa = ((b[0] - px) * (c[1] - py) - (b[1] - py) * (c[0] - px)) * a[2]
+        wb = ((c[0] - px) * (a[1] - py) - (c[1] - py) * (a[0] - px)) * b[2]
+        wc = ((a[0] - px) * (b[1] - py) - (a[1] - py) * (b[0] - px)) * c[2]
+        total = wa + wb + wc
+        if total != 0.0:
+            weights = clamp_weights(wb / total, wc / total)
+    else:
+        # A triangle clipped at the hidden boundary has no picture of its corners: its plane seen along the ray.
+        hit = intersect_triangle(point[i], direction[i], v0, v1, v2)
+        weights = clamp_weights(hit.u, hit.v)
+    position = v0 + weights[0] * (v1 - v0) + weights[1] * (v2 - v0)
+    out_triangle[i] = triangle
+    out_u[i] = weights[0]
+    out_v[i] = weights[1]
+    out_distance[i] = wp.length(position - point[i])
+    out_status[i] = wp.uint8(CONVERGED)
+
+
+def solve_frame(scene: Scene, camera: Camera, unit_from_scene: np.ndarray) -> SolveFrame:
+    """The frame of a reflector seen by a camera, composed in float64."""
+    linear = unit_from_scene[:3, :3]
+    eye = linear @ (camera.eye - scene.origin) + unit_from_scene[:3, 3]
+    frame = SolveFrame()
+    frame.unit_from_scene = wp.mat33(linear.astype(np.float32))
+    frame.unit_offset = wp.vec3(*unit_from_scene[:3, 3])
+    frame.eye_from_unit = wp.mat33(np.linalg.inv(linear).astype(np.float32))
+    frame.eye = wp.vec3(*eye)
+    return frame
+
+
+def reflect(
+    scene: Scene,
+    reflector: Reflector,
+    technique: int,
+    unit_from_scene: np.ndarray,
+    solve_vertices: Callable,
+    solve_boundary: Callable,
+    gbuffer: GBuffer,
+    pixels: MirrorPixels,
+    camera: Camera,
+    settings: Settings,
+    history: History | None,
+) -> ReflectionLayer:
+    """Reflect a scene in one mirror by virtual objects.
+
+    Args:
+        unit_from_scene: float64 [4, 4] similarity into the solver's frame.
+        solve_vertices: (frame, warm, out VertexView) -> None, fills one entry per scene vertex.
+        solve_boundary: (frame, edges vec2i, out points vec3) -> None, see `reflector_map.boundary_kernel`.
+        history: The same reflector's layer history of the previous frame.
+
+    Returns:
+        The layer; with `refine="exact"` every pixel is the hit of an exact ray-triangle test.
+    """
+    layer = ReflectionLayer.empty(pixels, technique, scene.device)
+    if pixels.count == 0:
+        return layer
+    timer = StageTimer(scene.device)
+    part = scene.parts[reflector.part]
+    with timer("search"):
+        vertices, warm = _vertices(scene, history)
+        frame = solve_frame(scene, camera, unit_from_scene)
+        solve_vertices(frame, warm, vertices)
+        layer.history = History(vertices.seed)
+    with timer("virtual_raster"):
+        target = raster.make_target(gbuffer.view, pixels.box, scene.device, gbuffer.reflector_id, reflector.id)
+        drawn = _draw_others(scene, part, target, vertices, settings.threads)
+        clipped, failed = _draw_straddling(scene, part, target, frame, vertices, solve_boundary, gbuffer, settings)
+    if settings.refine == "off":
+        with timer("candidates"):
+            launch(
+                candidate_hits_kernel,
+                pixels.count,
+                [scene.view, gbuffer.view, target.view, vertices.screen]
+                + [pixels.pixel, pixels.point, pixels.direction]
+                + [layer.triangle, layer.u, layer.v, layer.distance, layer.status],
+                scene.device,
+                settings.threads,
+            )
+        layer.statistics.update(candidate=pixels.count)
+    else:
+        with timer("refine"):
+            doubtful = refine.settle(scene, gbuffer, pixels, target, layer, settings, trust_sky=failed == 0)
+        with timer("trace"):
+            bvh.trace_pixels(
+                scene, gbuffer, pixels, layer, reflector.part, reflector.convex, doubtful, settings.threads
+            )
+    layer.statistics.update(vertices=scene.vertex_count, drawn=drawn, clipped=clipped, failed=failed, warm=warm)
+    layer.timings = timer.ms
+    return layer
+
+
+def _vertices(scene: Scene, history: History | None) -> tuple[VertexView, bool]:
+    """Fresh per-vertex results; seeds of the previous frame where they are of the same scene."""
+    count = scene.vertex_count
+    vertices = VertexView()
+    vertices.screen = wp.full(count, wp.vec4(0.0, 0.0, raster.DROPPED, 0.0), dtype=wp.vec4, device=scene.device)
+    vertices.status = wp.zeros(count, dtype=wp.uint8, device=scene.device)
+    vertices.residual = wp.zeros(count, dtype=float, device=scene.device)
+    warm = history is not None and len(history.seed) == count and history.seed.device == scene.device
+    # Copied: the previous frame keeps its own answer.
+    vertices.seed = wp.clone(history.seed) if warm else wp.zeros(count, dtype=wp.vec3, device=scene.device)
+    return vertices, warm
+
+
+def _other_triangles(scene: Scene, part) -> list[tuple[int, wp.array]]:
+    """(first triangle, triangles) of the ranges before and after the mirror's own."""
+    end = part.first_triangle + part.triangle_count
+    ranges = [(0, part.first_triangle), (end, scene.triangle_count)]
+    return [(low, scene.view.triangles[low:high]) for low, high in ranges if high > low]
+
+
+def _draw_others(scene, part, target, vertices, threads) -> int:
+    drawn = 0
+    for offset, triangles in _other_triangles(scene, part):
+        drawn += raster.rasterise(target, vertices.screen, triangles, id_offset=offset, threads=threads)
+    return drawn
+
+
+def _draw_straddling(scene, part, target, frame, vertices, solve_boundary, gbuffer, settings) -> tuple[int, int]:
+    """Draw the visible side of triangles that straddle the hidden boundary; (drawn, triangles with a failed corner).
+
+    On the boundary the line of sight grazes the mirror, so the virtual point is the real one.
+    """
+    kind = wp.zeros(scene.triangle_count, dtype=wp.uint8, device=scene.device)
+    launch(
+        straddle_kernel,
+        scene.triangle_count,
+        [scene.view.triangles, vertices.status, kind],
+        scene.device,
+        settings.threads,
+    )
+    host_kind = kind.numpy()
+    failed = int((host_kind == 2).sum())
+    ids = np.flatnonzero(host_kind == 1)
+    ids = ids[(ids < part.first_triangle) | (ids >= part.first_triangle + part.triangle_count)]
+    if not len(ids):
+        return 0, failed
+    corner = scene.host_triangles[ids]
+    visible = vertices.status.numpy()[corner] == int(Status.CONVERGED)
+    # Turn each triangle so that the corner unlike the other two comes first.
+    single = visible.sum(axis=1) == 1
+    odd = np.where(single, visible.argmax(axis=1), (~visible).argmax(axis=1))
+    corner = np.take_along_axis(corner, (odd[:, None] + np.arange(3)) % 3, axis=1)
+    a, b, c = corner.T
+    edges = np.concatenate(
+        [
+            np.where(single[:, None], np.stack([a, b], 1), np.stack([b, a], 1)),
+            np.where(single[:, None], np.stack([a, c], 1), np.stack([c, a], 1)),
+        ]
+    ).astype(np.int32)
+    points = wp.empty(len(edges), dtype=wp.vec3, device=scene.device)
+    solve_boundary(frame, wp.array(edges, dtype=wp.vec2i, device=scene.device), points)
+    boundary = wp.empty(len(edges), dtype=wp.vec4, device=scene.device)
+    launch(project_points_kernel, len(edges), [points, gbuffer.view, boundary], scene.device, settings.threads)
+    known = vertices.screen.numpy()
+    n = len(ids)
+    cut = boundary.numpy()
+    # One visible corner: (a, cut ab, cut ac). Two: the quadrilateral b, c, cut ca, cut ba as two triangles.
+    screen = np.concatenate([known[a], known[b], known[c], cut[:n], cut[n:]]).astype(np.float32)
+    row = np.arange(n)
+    va, vb, vc, vab, vac = (row + k * n for k in range(5))
+    ones = np.stack([va, vab, vac], 1)[single]
+    twos = np.concatenate([np.stack([vb, vc, vac], 1)[~single], np.stack([vb, vac, vab], 1)[~single]])
+    triangles = np.concatenate([ones, twos]).astype(np.int32)
+    owners = np.concatenate([ids[single], ids[~single], ids[~single]]).astype(np.int32)
+    raster.rasterise(
+        target,
+        wp.array(screen, dtype=wp.vec4, device=scene.device),
+        wp.array(triangles, dtype=wp.vec3i, device=scene.device),
+        ids=wp.array(owners, dtype=int, device=scene.device),
+        threads=settings.threads,
+    )
+    return n, failed

@@ -1,0 +1,224 @@
+"""Exact hits from a picture of virtual objects: where forward and backward meet.
+
+The z-buffer of a reflector's virtual meshes names a candidate triangle per mirror pixel. One exact ray-triangle test
+settles most pixels; a ray that leaves the candidate across an edge walks to the neighbour there. What is in doubt (no
+candidate beside one, an edge of a nearer object close by, a walk that ends) is left to the BVH. A candidate that is hit
+is taken only where its 3x3 neighbourhood holds nothing nearer that the ray might meet first.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+
+from warp_reflect import raster
+from warp_reflect.launch import launch
+from warp_reflect.layers import GBuffer, MirrorPixels, ReflectionLayer
+from warp_reflect.scene import Scene, SceneView
+from warp_reflect.settings import Settings, Status
+from warp_reflect.shapes import clamp_weights, intersect_triangle
+
+wp.set_module_options({"enable_backward": False})
+
+CONVERGED = wp.constant(int(Status.CONVERGED))
+SKY = wp.constant(int(Status.SKY))
+
+# Who settled a pixel.
+DOUBT = wp.constant(0)
+CANDIDATE = wp.constant(1)
+WALK = wp.constant(2)
+EMPTY = wp.constant(3)
+
+# Of the depth key. A surface seen in a mirror is smooth on the screen: its key's second difference stays below this;
+# what exceeds it is the edge of a nearer object.
+DEPTH_STEP = wp.constant(0.01)
+# Candidates of another patch at nearly the same depth (a plate on a table) are tested too and the nearer hit is taken.
+NEARER_SHARE = wp.constant(0.98)
+
+
+@wp.struct
+class WalkHit:
+    triangle: int  # -1: the walk ended outside every triangle it met
+    u: float
+    v: float
+    t: float
+    hops: int
+    turned: int  # 1: the hit triangle faces the ray unlike the first one
+
+
+@wp.func
+def walk(
+    scene: SceneView,
+    neighbours: wp.array(dtype=wp.vec3i),
+    origin: wp.vec3,
+    direction: wp.vec3,
+    start: int,
+    hop_count: int,
+) -> WalkHit:
+    """Test a triangle, then the neighbour across the most violated edge, at most `hop_count` times."""
+    result = WalkHit()
+    result.triangle = -1
+    triangle = start
+    previous = int(-1)
+    facing = float(0.0)
+    hops = int(0)
+    while triangle >= 0 and hops <= hop_count:
+        t = scene.triangles[triangle]
+        hit = intersect_triangle(origin, direction, scene.points[t[0]], scene.points[t[1]], scene.points[t[2]])
+        if hit.det == 0.0:
+            return result
+        if hops == 0:
+            facing = hit.det
+        if hit.hit != 0:
+            if hit.t > 0.0:
+                result.triangle = triangle
+                weights = clamp_weights(hit.u, hit.v)
+                result.u = weights[0]
+                result.v = weights[1]
+                result.t = hit.t
+                result.hops = hops
+                if facing * hit.det < 0.0:
+                    result.turned = 1
+            return result
+        # Edge k joins corners k and k + 1; the weight of the corner opposite to it says how far outside the ray is.
+        edge = int(0)
+        lowest = hit.v
+        if hit.w < lowest:
+            lowest = hit.w
+            edge = 1
+        if hit.u < lowest:
+            edge = 2
+        following = neighbours[triangle][edge]
+        if following == previous:
+            return result
+        previous = triangle
+        triangle = following
+        hops += 1
+    return result
+
+
+@wp.func
+def cell_key(target: raster.TargetView, x: int, y: int) -> wp.uint64:
+    """Z-buffer key at an image pixel, 0 outside the box."""
+    if x < target.x0 or x >= target.x1 or y < target.y0 or y >= target.y1:
+        return wp.uint64(0)
+    return target.key[(y - target.y0) * (target.x1 - target.x0) + x - target.x0]
+
+
+@wp.func
+def is_mirror(target: raster.TargetView, x: int, y: int) -> bool:
+    if x < target.x0 or x >= target.x1 or y < target.y0 or y >= target.y1:
+        return False
+    return target.mask[y * target.mask_width + x] == target.mask_value
+
+
+@wp.kernel
+def settle_kernel(
+    first: int,
+    scene: SceneView,
+    neighbours: wp.array(dtype=wp.vec3i),
+    target: raster.TargetView,
+    # Mirror pixels:
+    pixel: wp.array(dtype=int),
+    point: wp.array(dtype=wp.vec3),
+    direction: wp.array(dtype=wp.vec3),
+    # Settings:
+    hop_count: int,
+    trust_sky: int,
+    # Outputs:
+    out_triangle: wp.array(dtype=int),
+    out_u: wp.array(dtype=float),
+    out_v: wp.array(dtype=float),
+    out_distance: wp.array(dtype=float),
+    out_status: wp.array(dtype=wp.uint8),
+    out_settled: wp.array(dtype=wp.uint8),
+):
+    """One thread per mirror pixel."""
+    i = first + wp.tid()
+    out_settled[i] = wp.uint8(DOUBT)
+    x = pixel[i] % target.mask_width
+    y = pixel[i] / target.mask_width
+    key = cell_key(target, x, y)
+    candidate = raster.key_triangle(key)
+    if candidate < 0:
+        if trust_sky == 0:
+            return
+        for dy in range(-1, 2):
+            for dx in range(-1, 2):
+                if cell_key(target, x + dx, y + dy) != wp.uint64(0):
+                    return
+        out_triangle[i] = -1
+        out_status[i] = wp.uint8(SKY)
+        out_settled[i] = wp.uint8(EMPTY)
+        return
+    hit = walk(scene, neighbours, point[i], direction[i], candidate, hop_count)
+    if hit.triangle < 0 or hit.turned != 0:
+        return
+    depth = raster.key_depth(key)
+    patch = scene.triangle_patch[candidate]
+    for dy in range(-1, 2):
+        for dx in range(-1, 2):
+            if dx == 0 and dy == 0:
+                continue
+            near_key = cell_key(target, x + dx, y + dy)
+            other = raster.key_triangle(near_key)
+            if other < 0 or other == candidate:
+                continue
+            near_depth = raster.key_depth(near_key)
+            opposite = raster.key_depth(cell_key(target, x - dx, y - dy))
+            bend = near_depth - depth
+            if is_mirror(target, x - dx, y - dy) and opposite > 0.0:
+                # Only a rise counts: an opposite side that falls away is a farther surface.
+                bend = near_depth - depth - wp.max(depth - opposite, 0.0)
+            if bend > DEPTH_STEP * depth:
+                return
+            if scene.triangle_patch[other] != patch and near_depth > NEARER_SHARE * depth:
+                second = walk(scene, neighbours, point[i], direction[i], other, hop_count)
+                if second.triangle >= 0 and second.t < hit.t:
+                    if second.turned != 0:
+                        return
+                    hit = second
+    out_triangle[i] = hit.triangle
+    out_u[i] = hit.u
+    out_v[i] = hit.v
+    out_distance[i] = hit.t
+    out_status[i] = wp.uint8(CONVERGED)
+    out_settled[i] = wp.uint8(wp.where(hit.hops == 0, CANDIDATE, WALK))
+
+
+def settle(
+    scene: Scene,
+    gbuffer: GBuffer,
+    pixels: MirrorPixels,
+    target: raster.Target,
+    layer: ReflectionLayer,
+    settings: Settings,
+    trust_sky: bool,
+) -> wp.array:
+    """Write the hits that a virtual picture settles into the layer.
+
+    Args:
+        target: The reflector's virtual z-buffer over `pixels.box`, ids are scene triangles.
+        layer: Receives triangle, u, v, distance, status of the settled pixels, and their counts.
+        trust_sky: No virtual triangle was dropped: an empty neighbourhood is sky.
+
+    Returns:
+        int32 indices into `pixels` of what the BVH must decide.
+    """
+    settled = wp.empty(pixels.count, dtype=wp.uint8, device=scene.device)
+    launch(
+        settle_kernel,
+        pixels.count,
+        [scene.view, scene.neighbours, target.view, pixels.pixel, pixels.point, pixels.direction]
+        + [settings.walk_hops, int(trust_sky)]
+        + [layer.triangle, layer.u, layer.v, layer.distance, layer.status, settled],
+        scene.device,
+        settings.threads,
+    )
+    host = settled.numpy()
+    doubtful = np.flatnonzero(host == DOUBT).astype(np.int32)
+    counts = np.bincount(host, minlength=4)
+    layer.statistics.update(
+        candidate=int(counts[CANDIDATE]), walk=int(counts[WALK]), empty=int(counts[EMPTY]), bvh=len(doubtful)
+    )
+    return wp.array(doubtful, dtype=int, device=scene.device)
