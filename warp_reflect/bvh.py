@@ -1,0 +1,437 @@
+"""Rays against the whole scene: the owner of the acceleration structure and the only module that queries it.
+
+Compiled finite-only (see `FINITE_FLAGS`): everything that reaches these kernels is finite by construction
+(points are checked when a stage is read, directions come normalised from `surface.py`), and NaN must not be
+tested for here.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+
+from warp_reflect import launch
+from warp_reflect.layers import GBuffer, MirrorPixels, ReflectionLayer
+from warp_reflect.scene import Scene, SceneView
+from warp_reflect.settings import Status
+from warp_reflect.shapes import clamp_weights, facet_normal, intersect_triangle, max_abs
+
+# Warp's own default (the option replaces it) and one flag: without NaN the box test's min and max are single
+# instructions, which makes a query 1.5 to 1.8 times as fast. Warp's headers name NAN: no warnings about that.
+# CUDA builds ignore the option.
+FINITE_FLAGS = (
+    "-march=native -mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000"
+    " -mllvm=-slp-recursion-max-depth=4 -menable-no-nans -Wno-nan-infinity-disabled"
+)
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FINITE_FLAGS})
+
+FLOAT_EPS = wp.constant(1.1920929e-7)  # one ulp of 1 in float32
+# A point made of barycentric weights is off its facet by at most about 4 roundings of its coordinates, the
+# traversal adds about 4 of its own; twice that.
+OFFSET_ULPS = wp.constant(16.0)
+# A convex body is left after two crossings; shared edges and the start may count twice.
+MAX_STEPS = wp.constant(8)
+# The box test of wp.mesh_query_ray rounds to nearest, not outwards, and loses up to 1.5e-2 of the rays aimed
+# exactly at a vertex. Moved by this many ulp a ray has left the corner's box planes (2.5e-6 lost are left, at
+# any offset); 1e-6 of the distance is no more than the rounding of a hit.
+RETRY_ULPS = wp.constant(8.0)
+# Share of the largest component below which one is worth nothing, and 1 / component overflows the box test.
+FLUSH_DIRECTION = wp.constant(1.0e-12)
+FAR = wp.constant(3.0e38)
+# Own facets that a ray leaves through from behind are at most this many of their longest edges away: the
+# sagitta of a tessellated surface is shorter than its edge.
+OWN_FACET_REACH = wp.constant(2.0)
+
+TRACE_SPLIT_MIN = 512  # rays; at 0.3 us and more a ray, half of them outweigh the hand-off to a second thread
+
+HIT = wp.constant(int(Status.CONVERGED))
+SKY = wp.constant(int(Status.SKY))
+STEP_LIMIT = wp.constant(int(Status.STEP_LIMIT))
+
+
+@wp.struct
+class RayHit:
+    """The first surface along a ray."""
+
+    triangle: int  # -1: none
+    t: float  # in lengths of the direction
+    u: float  # weights of the triangle's second and third corner
+    v: float
+    status: int  # CONVERGED, SKY or STEP_LIMIT
+
+
+@wp.struct
+class Body:
+    """The mirror that a ray starts on: a range of triangles."""
+
+    first_triangle: int
+    triangle_count: int  # 0: no body
+    convex: int  # a ray that leaves it cannot meet it again
+
+
+@wp.func
+def ray_offset(p: wp.vec3) -> float:
+    """How far off its surface a float32 point may lie, and so how far from it a ray starts, in units of p.
+
+    From the summed magnitudes of its coordinates: a fixed distance is wrong at some scale.
+    """
+    return OFFSET_ULPS * FLOAT_EPS * (wp.abs(p[0]) + wp.abs(p[1]) + wp.abs(p[2]))
+
+
+@wp.func
+def flush_direction(direction: wp.vec3) -> wp.vec3:
+    """The direction with negligible components exactly zero (which the traversal handles apart)."""
+    x = direction[0]
+    y = direction[1]
+    z = direction[2]
+    least = FLUSH_DIRECTION * max_abs(direction)
+    if wp.abs(x) < least:
+        x = float(0.0)
+    if wp.abs(y) < least:
+        y = float(0.0)
+    if wp.abs(z) < least:
+        z = float(0.0)
+    return wp.vec3(x, y, z)
+
+
+@wp.func
+def moved_direction(direction: wp.vec3) -> wp.vec3:
+    """The direction turned by a few ulp, unevenly, so that it leaves edges and diagonals."""
+    step = RETRY_ULPS * FLOAT_EPS * max_abs(direction)
+    return direction + wp.vec3(step, -0.625 * step, 0.375 * step)
+
+
+@wp.func
+def scene_facet_normal(scene: SceneView, triangle: int) -> wp.vec3:
+    """Unit normal of a triangle of the scene by its winding."""
+    tri = scene.triangles[triangle]
+    return facet_normal(scene.points[tri[0]], scene.points[tri[1]], scene.points[tri[2]])
+
+
+@wp.func
+def leaves_from_behind(
+    scene: SceneView, triangle: int, t: float, direction: wp.vec3, normal: wp.vec3, facet: int
+) -> bool:
+    """Whether a hit on the mirror's own body is no obstacle: the ray comes out through a facet from its back.
+
+    A point polished onto a concave surface lies behind its facets, and an interpolated normal can send a
+    grazing ray under its own facet. Both then cross the body from behind: the first near the start, the
+    second anywhere. The back is told by the winding and by the side that the eye sees of the start's own facet.
+    """
+    own = scene_facet_normal(scene, facet)
+    incident = direction - 2.0 * wp.dot(direction, normal) * normal
+    side = wp.where(wp.dot(own, incident) > 0.0, -1.0, 1.0)
+    if side * wp.dot(scene_facet_normal(scene, triangle), direction) <= 0.0:
+        return False
+    if side * wp.dot(own, direction) < 0.0:
+        return True
+    tri = scene.triangles[triangle]
+    a = scene.points[tri[0]]
+    b = scene.points[tri[1]]
+    c = scene.points[tri[2]]
+    return t <= OWN_FACET_REACH * wp.max(wp.max(max_abs(b - a), max_abs(c - b)), max_abs(a - c))
+
+
+@wp.func
+def trace_ray(
+    mesh_id: wp.uint64,
+    scene: SceneView,
+    # Ray:
+    origin: wp.vec3,
+    direction: wp.vec3,
+    normal: wp.vec3,
+    # The mirror it starts on:
+    facet: int,
+    body: Body,
+    # Settings:
+    retry: int,
+) -> RayHit:
+    """First surface along a ray that starts on a surface or in free space.
+
+    Args:
+        mesh_id: `Tracer.id`.
+        scene: The same scene's arrays.
+        origin: Scene frame.
+        direction: Unit length.
+        normal: Surface normal at the origin on the ray's side; zero for a ray from free space, which starts
+            at its origin exactly.
+        facet: Triangle that the ray starts on, never hit; -1 none, and then `body` is empty too.
+        body: The mirror around it. A convex one is stepped over, of others what the ray leaves from behind.
+        retry: 1: a ray that finds nothing is asked once more, turned by a few ulp.
+
+    Returns:
+        The hit; t, u and v are those of `intersect_triangle` from the origin itself, clamped to the triangle.
+    """
+    result = RayHit()
+    result.triangle = -1
+    result.status = SKY
+    d = flush_direction(direction)
+    offset = ray_offset(origin)
+    start = origin + offset * normal
+    if wp.dot(normal, normal) == 0.0:
+        offset = float(0.0)
+
+    t0 = float(0.0)
+    asked = int(0)
+    step = int(0)
+    # A range over the constant would be unrolled, eight traversals long.
+    while step < MAX_STEPS:
+        step += 1
+        query = wp.mesh_query_ray(mesh_id, start + t0 * d, d, FAR)
+        if not query.result:
+            if retry == 0 or asked != 0:
+                return result
+            asked = int(1)
+            d = moved_direction(d)
+        else:
+            triangle = query.face
+            t = t0 + query.t
+            step_over = triangle == facet
+            if triangle >= body.first_triangle and triangle < body.first_triangle + body.triangle_count:
+                if body.convex != 0:
+                    step_over = bool(True)
+                elif not step_over:
+                    step_over = leaves_from_behind(scene, triangle, t, d, normal, facet)
+            if not step_over:
+                tri = scene.triangles[triangle]
+                exact = intersect_triangle(
+                    origin, direction, scene.points[tri[0]], scene.points[tri[1]], scene.points[tri[2]]
+                )
+                result.triangle = triangle
+                result.status = HIT
+                result.t = t
+                # The traversal names its weights for the first and second corner.
+                weights = clamp_weights(query.v, 1.0 - query.u - query.v)
+                if exact.det != 0.0 and wp.min(wp.min(exact.u, exact.v), exact.w) > -0.01:
+                    result.t = wp.max(exact.t, 0.0)
+                    weights = clamp_weights(exact.u, exact.v)
+                result.u = weights[0]
+                result.v = weights[1]
+                return result
+            t0 = t + wp.max(ray_offset(start + t * d), offset)
+    result.status = STEP_LIMIT
+    return result
+
+
+@wp.kernel
+def trace_kernel(
+    first: int,
+    mesh_id: wp.uint64,
+    scene: SceneView,
+    origins: wp.array(dtype=wp.vec3),
+    directions: wp.array(dtype=wp.vec3),
+    out_triangle: wp.array(dtype=int),
+    out_t: wp.array(dtype=float),
+    out_u: wp.array(dtype=float),
+    out_v: wp.array(dtype=float),
+):
+    """One thread per ray from free space."""
+    i = first + wp.tid()
+    hit = trace_ray(mesh_id, scene, origins[i], directions[i], wp.vec3(0.0, 0.0, 0.0), -1, Body(), 1)
+    out_triangle[i] = hit.triangle
+    out_t[i] = hit.t
+    out_u[i] = hit.u
+    out_v[i] = hit.v
+
+
+@wp.kernel
+def trace_pixels_kernel(
+    first: int,
+    mesh_id: wp.uint64,
+    scene: SceneView,
+    # Mirror pixels:
+    facets: wp.array(dtype=int),
+    pixel: wp.array(dtype=int),
+    point: wp.array(dtype=wp.vec3),
+    normal: wp.array(dtype=wp.vec3),
+    direction: wp.array(dtype=wp.vec3),
+    body: Body,
+    index: wp.array(dtype=int),
+    indexed: int,
+    # Outputs:
+    out_triangle: wp.array(dtype=int),
+    out_u: wp.array(dtype=float),
+    out_v: wp.array(dtype=float),
+    out_distance: wp.array(dtype=float),
+    out_status: wp.array(dtype=wp.uint8),
+):
+    """One thread per asked mirror pixel."""
+    i = first + wp.tid()
+    if indexed != 0:
+        i = index[i]
+    hit = trace_ray(mesh_id, scene, point[i], direction[i], normal[i], facets[pixel[i]], body, 0)
+    out_triangle[i] = hit.triangle
+    out_u[i] = hit.u
+    out_v[i] = hit.v
+    out_distance[i] = hit.t
+    out_status[i] = wp.uint8(hit.status)
+
+
+@wp.kernel
+def retry_pixels_kernel(
+    first: int,
+    mesh_id: wp.uint64,
+    scene: SceneView,
+    # Mirror pixels:
+    facets: wp.array(dtype=int),
+    pixel: wp.array(dtype=int),
+    point: wp.array(dtype=wp.vec3),
+    normal: wp.array(dtype=wp.vec3),
+    direction: wp.array(dtype=wp.vec3),
+    body: Body,
+    index: wp.array(dtype=int),
+    indexed: int,
+    status: wp.array(dtype=wp.uint8),
+    # Outputs:
+    out_triangle: wp.array(dtype=int),
+    out_u: wp.array(dtype=float),
+    out_v: wp.array(dtype=float),
+    out_distance: wp.array(dtype=float),
+    out_status: wp.array(dtype=wp.uint8),
+):
+    """One thread per asked mirror pixel: a miss beside a hit, or without a neighbour, is asked again."""
+    i = first + wp.tid()
+    if indexed != 0:
+        i = index[i]
+    if int(status[i]) != SKY:
+        return
+    again = int(0)
+    neighbours = int(0)
+    if i > 0:
+        if pixel[i - 1] == pixel[i] - 1:
+            neighbours += 1
+            if int(status[i - 1]) != SKY:
+                again = int(1)
+    if i + 1 < pixel.shape[0]:
+        if pixel[i + 1] == pixel[i] + 1:
+            neighbours += 1
+            if int(status[i + 1]) != SKY:
+                again = int(1)
+    if again == 0 and neighbours > 0:
+        return
+    hit = trace_ray(
+        mesh_id, scene, point[i], moved_direction(direction[i]), normal[i], facets[pixel[i]], body, 0
+    )
+    if hit.status == SKY:
+        return
+    out_triangle[i] = hit.triangle
+    out_u[i] = hit.u
+    out_v[i] = hit.v
+    out_distance[i] = hit.t
+    out_status[i] = wp.uint8(hit.status)
+
+
+class Tracer:
+    """Owner of the triangle BVH of a scene.
+
+    Attributes:
+        id: Handle for `trace_ray`; valid while this object lives. 0 for a scene without triangles, which has
+            no structure and must not be queried.
+    """
+
+    def __init__(self, scene: Scene):
+        self.scene = scene
+        self._mesh = None
+        if scene.triangle_count:
+            # The traversal wants flat indices. Copied: the structure's memory must not move.
+            indices = wp.array(scene.host_triangles.reshape(-1), dtype=wp.int32, device=scene.device)
+            constructor = "lbvh" if scene.device.is_cuda else "sah"
+            self._mesh = wp.Mesh(scene.view.points, indices, bvh_constructor=constructor)
+
+    @property
+    def id(self) -> int:
+        return self._mesh.id if self._mesh is not None else 0
+
+    def refit(self) -> None:
+        """Fit the structure to points that were moved in place."""
+        if self._mesh is not None:
+            self._mesh.refit()
+
+    def trace(self, origins, directions, threads: int = 0) -> tuple[wp.array, wp.array, wp.array, wp.array]:
+        """First hits of rays from free space.
+
+        Args:
+            origins: Scene frame, finite, shape [n, 3] or a vec3 array.
+            directions: Likewise, of unit length.
+            threads: CPU threads; 0: one per core.
+
+        Returns:
+            (triangle int32 [n], -1 none; t float32 [n]; u, v float32 [n], the weights of the second and third
+            corner).
+        """
+        device = self.scene.device
+        origins = _vectors(origins, device)
+        directions = _vectors(directions, device)
+        n = len(origins)
+        triangle = wp.full(n, -1, dtype=int, device=device)
+        t, u, v = (wp.zeros(n, dtype=float, device=device) for _ in range(3))
+        if self._mesh is not None:
+            inputs = [wp.uint64(self.id), self.scene.view, origins, directions, triangle, t, u, v]
+            launch.launch(trace_kernel, n, inputs, device, threads)
+        return triangle, t, u, v
+
+
+def _vectors(values, device) -> wp.array:
+    if isinstance(values, wp.array):
+        return values
+    return wp.array(np.ascontiguousarray(values, np.float32), dtype=wp.vec3, device=device)
+
+
+def body_of(scene: Scene, part: int, convex: bool) -> Body:
+    """The triangles of a part as the body that its own reflected rays start on; part -1: none."""
+    body = Body()
+    if part >= 0:
+        body.first_triangle = scene.parts[part].first_triangle
+        body.triangle_count = scene.parts[part].triangle_count
+        body.convex = int(convex)
+    return body
+
+
+def trace_pixels(
+    scene: Scene,
+    gbuffer: GBuffer,
+    pixels: MirrorPixels,
+    layer: ReflectionLayer,
+    part: int,
+    convex: bool,
+    index: wp.array | None = None,
+    threads: int = 0,
+) -> int:
+    """Follow the reflected rays of mirror pixels through the BVH and write their hits into the layer.
+
+    Args:
+        scene: Its BVH is built if this is the first use.
+        gbuffer: Names the facet each pixel starts on.
+        pixels: The mirror pixels of a reflector.
+        layer: Receives triangle, u, v, distance and status (CONVERGED, SKY, STEP_LIMIT) of the pixels asked.
+        part: The mirror itself, index into `scene.parts`.
+        convex: The mirror's own triangles are stepped over.
+        index: int32, which of the pixels, each at most once; None: all.
+        threads: CPU threads; 0: one per core.
+
+    Returns:
+        The number of pixels asked.
+    """
+    count = pixels.count if index is None else len(index)
+    if count == 0:
+        return 0
+    rays = [
+        wp.uint64(scene.tracer.id),
+        scene.view,
+        gbuffer.triangle,
+        pixels.pixel,
+        pixels.point,
+        pixels.normal,
+        pixels.direction,
+        body_of(scene, part, convex),
+        pixels.pixel if index is None else index,
+        int(index is not None),
+    ]
+    outputs = [layer.triangle, layer.u, layer.v, layer.distance, layer.status]
+    launch.launch(
+        trace_pixels_kernel, count, rays + outputs, scene.device, threads, split_min=TRACE_SPLIT_MIN
+    )
+    # The neighbours' answers are read from a copy, so that the order of threads cannot matter.
+    before = wp.clone(layer.status)
+    launch.launch(retry_pixels_kernel, count, [*rays, before, *outputs], scene.device, threads)
+    return count

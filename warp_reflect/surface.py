@@ -1,0 +1,350 @@
+"""The surface that the eye sees at a pixel, and the compact list of a reflector's pixels.
+
+There is one mirror surface, the same for every technique: the facet's position and its interpolated shading
+normal, or for a gprim the analytic surface behind the facet, met by the eye ray itself ("polished").
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import warp as wp
+
+from warp_reflect import launch
+from warp_reflect.layers import CameraView, GBuffer, MirrorPixels, eye_ray_direction, eye_ray_origin
+from warp_reflect.scene import SHAPE_NONE, SHAPE_PLANE, PatchView, Scene, SceneView
+from warp_reflect.shapes import clamp_weights, facet_normal, intersect_triangle, max_abs, unit
+
+wp.set_module_options({"enable_backward": False})
+
+# An interpolated normal shorter than this has lost its direction (corners apart); the facet's is used.
+LEAST_NORMAL = wp.constant(0.1)
+# A ray that passes its facet this far outside (in weights) meets the facet's plane somewhere else altogether.
+LEAST_WEIGHT = wp.constant(-0.5)
+# Share of the surface's slope along the ray that the facet point must show for its sign to be trusted.
+SURE_SLOPE = wp.constant(0.5)
+
+
+@wp.struct
+class Surface:
+    """What is seen at a pixel. Vectors have world axes; the eye frame has its origin at the eye."""
+
+    p_eye: wp.vec3
+    p_scene: wp.vec3
+    incident: wp.vec3  # unit, from the eye to the point
+    normal: wp.vec3  # unit shading normal, on the eye's side
+    facet: wp.vec3  # unit normal of the facet by its winding; zero if it has no area
+    u: float  # weights of the facet's second and third corner
+    v: float
+
+
+@wp.func
+def shading_normal(scene: SceneView, triangle: int, u: float, v: float, facet: wp.vec3) -> wp.vec3:
+    """Unit normal interpolated between the corners, the facet's if they have none; not turned to the eye."""
+    index = scene.normal_index[triangle]
+    if index[0] < 0:
+        return facet
+    n = (1.0 - u - v) * scene.normals[index[0]] + u * scene.normals[index[1]] + v * scene.normals[index[2]]
+    if wp.dot(n, n) < LEAST_NORMAL * LEAST_NORMAL:
+        return facet
+    return unit(n)
+
+
+@wp.func
+def polish(
+    patch: PatchView,
+    p: wp.vec3,
+    direction: wp.vec3,
+    facet: wp.vec3,
+    reach: float,
+) -> wp.vec4:
+    """Move a facet point along its ray onto the analytic surface behind the facet.
+
+    The quadric is solved from the facet point, not from the eye: the constant term is then small and exact,
+    and so is the root. Of the two roots the one whose surface is crossed in the same sense as the facet is
+    meant; near the silhouette the other may be nearer.
+
+    Args:
+        patch: Has a shape.
+        p: Facet point, scene frame.
+        direction: Of the ray, unit length.
+        facet: Unit normal of the facet.
+        reach: Bound on the distance moved. [scene units]
+
+    Returns:
+        Unit normal and distance moved; a zero normal if the ray has no such root in reach.
+    """
+    m = patch.unit_from_scene
+    q = wp.transform_point(m, p)
+    d = wp.transform_vector(m, direction)
+    gradient = wp.vec3(0.0, 0.0, 1.0)
+    s = float(0.0)
+    if patch.shape == SHAPE_PLANE:
+        if d[2] == 0.0:
+            return wp.vec4(0.0, 0.0, 0.0, 0.0)
+        s = -q[2] / d[2]
+    else:
+        a = patch.quadric[0]
+        b = patch.quadric[1]
+        c = patch.quadric[2]
+        # f(q + s d) = qa s^2 + 2 qb s + qc, half the derivative is qb + qa s = -+ root.
+        qa = d[0] * d[0] + d[1] * d[1] + a * d[2] * d[2]
+        qb = q[0] * d[0] + q[1] * d[1] + (a * q[2] + 0.5 * b) * d[2]
+        qc = q[0] * q[0] + q[1] * q[1] + (a * q[2] + b) * q[2] - c
+        disc = qb * qb - qa * qc
+        if disc < 0.0:
+            return wp.vec4(0.0, 0.0, 0.0, 0.0)
+        root = wp.sqrt(disc)
+        if wp.abs(qb) > SURE_SLOPE * root:
+            root = wp.sign(qb) * root
+        else:
+            here = wp.vec3(q[0], q[1], a * q[2] + 0.5 * b)
+            # Sense of the crossing: of the facet, times whether the gradient agrees with the winding.
+            if wp.dot(facet, direction) * wp.dot(wp.transform_vector(m, facet), here) < 0.0:
+                root = -root
+        if qb * root > 0.0:
+            # Half derivative = +root has s = (root - qb) / qa = -qc / (qb + root): no cancellation.
+            s = -qc / (qb + root)
+        elif qa != 0.0:
+            s = (root - qb) / qa
+        elif qc != 0.0:
+            return wp.vec4(0.0, 0.0, 0.0, 0.0)
+        moved = q + s * d
+        gradient = wp.vec3(moved[0], moved[1], a * moved[2] + 0.5 * b)
+    if not (wp.abs(s) <= reach):
+        return wp.vec4(0.0, 0.0, 0.0, 0.0)
+    n = unit(wp.transform_vector(wp.transpose(m), gradient))
+    return wp.vec4(n[0], n[1], n[2], s)
+
+
+@wp.func
+def surface_at(scene: SceneView, camera: CameraView, triangle: int, x: float, y: float) -> Surface:
+    """The surface that the eye sees at pixel coordinate (x, y) on a triangle of the G-buffer.
+
+    Weights come from the eye frame, where a far scene loses nothing. The raster snaps to 1/256 pixel, so a
+    pixel's ray may pass just outside the facet. A polished point is still the ray's own (the facet only tells
+    where to look); otherwise the weights are clamped and the incident direction is the one to the point.
+    """
+    tri = scene.triangles[triangle]
+    v0 = scene.points[tri[0]]
+    v1 = scene.points[tri[1]]
+    v2 = scene.points[tri[2]]
+    a = v0 - camera.eye
+    b = v1 - camera.eye
+    c = v2 - camera.eye
+    direction = eye_ray_direction(camera, x, y)
+    hit = intersect_triangle(eye_ray_origin(camera, x, y), direction, a, b, c)
+    result = Surface()
+    result.facet = facet_normal(a, b, c)
+    weights = clamp_weights(hit.u, hit.v)
+    if hit.det == 0.0:
+        weights = wp.vec2(1.0 / 3.0, 1.0 / 3.0)
+    result.u = weights[0]
+    result.v = weights[1]
+    patch = scene.triangle_patch[triangle]
+    if scene.patches[patch].shape != SHAPE_NONE:
+        if hit.det != 0.0 and wp.min(wp.min(hit.u, hit.v), hit.w) > LEAST_WEIGHT:
+            weights = wp.vec2(hit.u, hit.v)
+        incident = unit(direction)
+        w = 1.0 - weights[0] - weights[1]
+        p = w * v0 + weights[0] * v1 + weights[1] * v2
+        reach = wp.max(wp.max(max_abs(b - a), max_abs(c - b)), max_abs(a - c))
+        polished = polish(scene.patches[patch], p, incident, result.facet, reach)
+        n = wp.vec3(polished[0], polished[1], polished[2])
+        if n[0] != 0.0 or n[1] != 0.0 or n[2] != 0.0:
+            step = polished[3] * incident
+            result.p_scene = p + step
+            result.p_eye = w * a + weights[0] * b + weights[1] * c + step
+            if wp.dot(n, incident) > 0.0:
+                n = -n
+            result.incident = incident
+            result.normal = n
+            return result
+    w = 1.0 - result.u - result.v
+    result.p_scene = w * v0 + result.u * v1 + result.v * v2
+    result.p_eye = w * a + result.u * b + result.v * c
+    incident = unit(result.p_eye)
+    if camera.orthographic != 0:
+        incident = unit(direction)
+    n = shading_normal(scene, triangle, result.u, result.v, result.facet)
+    if wp.dot(n, incident) > 0.0:
+        n = -n
+    if n[0] == 0.0 and n[1] == 0.0 and n[2] == 0.0:
+        n = -incident
+    result.incident = incident
+    result.normal = n
+    return result
+
+
+@wp.kernel
+def reflector_id_kernel(
+    first: int,
+    triangle: wp.array(dtype=int),
+    triangle_patch: wp.array(dtype=int),
+    patch_reflector: wp.array(dtype=int),
+    out_reflector: wp.array(dtype=int),
+):
+    """One thread per pixel."""
+    i = first + wp.tid()
+    tri = triangle[i]
+    reflector = int(0)
+    if tri >= 0:
+        reflector = patch_reflector[triangle_patch[tri]]
+    out_reflector[i] = reflector
+
+
+@wp.kernel
+def mirror_pixels_kernel(
+    first: int,
+    scene: SceneView,
+    camera: CameraView,
+    triangle: wp.array(dtype=int),
+    pixel: wp.array(dtype=int),
+    out_point: wp.array(dtype=wp.vec3),
+    out_normal: wp.array(dtype=wp.vec3),
+    out_direction: wp.array(dtype=wp.vec3),
+):
+    """One thread per mirror pixel."""
+    i = first + wp.tid()
+    p = pixel[i]
+    row = p // camera.width
+    x = float(p - row * camera.width) + 0.5
+    s = surface_at(scene, camera, triangle[p], x, float(row) + 0.5)
+    out_point[i] = s.p_scene
+    out_normal[i] = s.normal
+    # The unit length is lost to rounding only; restored because the trace's distances count in it.
+    out_direction[i] = unit(s.incident - 2.0 * wp.dot(s.incident, s.normal) * s.normal)
+
+
+def mirror_pixels(
+    scene: Scene, gbuffer: GBuffer, parts: Mapping[int, int], threads: int = 0
+) -> tuple[dict[int, MirrorPixels], wp.array]:
+    """The pixels of every reflector with their points, normals and reflected directions.
+
+    Args:
+        scene: On the G-buffer's device.
+        gbuffer: What the eye sees.
+        parts: Reflector id (1-based) to the index of its part in `scene.parts`.
+        threads: CPU threads; 0: one per core.
+
+    Returns:
+        (`MirrorPixels` per id, of length 0 where a reflector is not seen; reflector id per pixel, int32
+        [height * width], 0 none).
+    """
+    device = scene.device
+    width, height = gbuffer.camera.size
+    patch_reflector = np.zeros(max(len(scene.patch_shapes), 1), np.int32)
+    for reflector, part in parts.items():
+        patch_reflector[scene.parts[part].patches] = reflector
+    reflector_id = wp.empty(width * height, dtype=int, device=device)
+    launch.launch(
+        reflector_id_kernel,
+        width * height,
+        [
+            gbuffer.triangle,
+            scene.view.triangle_patch,
+            wp.array(patch_reflector, dtype=int, device=device),
+            reflector_id,
+        ],
+        device,
+        threads,
+    )
+    found = _pixels_by_reflector(reflector_id.numpy(), parts)
+    result = {}
+    for reflector in parts:
+        pixel = found[reflector]
+        n = len(pixel)
+        mirror = MirrorPixels(
+            reflector=reflector,
+            pixel=wp.array(pixel, dtype=int, device=device),
+            point=wp.empty(n, dtype=wp.vec3, device=device),
+            normal=wp.empty(n, dtype=wp.vec3, device=device),
+            direction=wp.empty(n, dtype=wp.vec3, device=device),
+            box=_bounds(pixel, width),
+        )
+        launch.launch(
+            mirror_pixels_kernel,
+            n,
+            [
+                scene.view,
+                gbuffer.view,
+                gbuffer.triangle,
+                mirror.pixel,
+                mirror.point,
+                mirror.normal,
+                mirror.direction,
+            ],
+            device,
+            threads,
+        )
+        result[reflector] = mirror
+    return result, reflector_id
+
+
+def _pixels_by_reflector(reflector_id: np.ndarray, parts: Mapping[int, int]) -> dict[int, np.ndarray]:
+    """Ascending int32 pixel numbers of every id."""
+    pixel = np.flatnonzero(reflector_id).astype(np.int32)
+    if len(parts) == 1:
+        return dict.fromkeys(parts, pixel)
+    ids = reflector_id[pixel]
+    return {reflector: pixel[ids == reflector] for reflector in parts}
+
+
+def _bounds(pixel: np.ndarray, width: int) -> tuple[int, int, int, int]:
+    """Half-open bounds (x0, y0, x1, y1) of ascending pixel numbers; all 0 if there are none."""
+    if not len(pixel):
+        return (0, 0, 0, 0)
+    column = pixel % width
+    return (
+        int(column.min()),
+        int(pixel[0]) // width,
+        int(column.max()) + 1,
+        int(pixel[-1]) // width + 1,
+    )
+
+
+@wp.kernel
+def surface_channels_kernel(
+    first: int,
+    scene: SceneView,
+    camera: CameraView,
+    triangle: wp.array(dtype=int),
+    out_depth: wp.array(dtype=float),
+    out_normal: wp.array(dtype=wp.vec3),
+    out_prim: wp.array(dtype=int),
+):
+    """One thread per pixel."""
+    i = first + wp.tid()
+    tri = triangle[i]
+    if tri < 0:
+        out_depth[i] = 0.0
+        out_normal[i] = wp.vec3(0.0, 0.0, 0.0)
+        out_prim[i] = 0
+        return
+    row = i // camera.width
+    s = surface_at(scene, camera, tri, float(i - row * camera.width) + 0.5, float(row) + 0.5)
+    out_depth[i] = wp.dot(camera.forward, s.p_eye)
+    out_normal[i] = s.normal
+    out_prim[i] = scene.patches[scene.triangle_patch[tri]].prim
+
+
+def surface_channels(scene: Scene, gbuffer: GBuffer, threads: int = 0) -> dict[str, wp.array]:
+    """The channels of what the eye sees directly.
+
+    Returns:
+        `Z` float32 [height * width], depth along the camera's forward axis in scene units, 0 background; `N`
+        vec3, unit shading normal turned to the eye; `primId` int32, 1-based, 0 background.
+    """
+    count = gbuffer.camera.size[0] * gbuffer.camera.size[1]
+    depth = wp.empty(count, dtype=float, device=scene.device)
+    normal = wp.empty(count, dtype=wp.vec3, device=scene.device)
+    prim = wp.empty(count, dtype=int, device=scene.device)
+    launch.launch(
+        surface_channels_kernel,
+        count,
+        [scene.view, gbuffer.view, gbuffer.triangle, depth, normal, prim],
+        scene.device,
+        threads,
+    )
+    return {"Z": depth, "N": normal, "primId": prim}
