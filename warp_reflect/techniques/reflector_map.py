@@ -18,7 +18,6 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from warp_reflect.bodies import Body, analyse
 from warp_reflect.cubemap import max_abs, project_to_cube
 from warp_reflect.launch import launch
 from warp_reflect.layers import Camera, CameraView, GBuffer, MirrorPixels, ReflectionLayer, Reflector
@@ -50,6 +49,7 @@ MIDPOINT_DELTA = wp.constant(0.5)  # |b_m - b| / |b| steered to; best factor per
 CONVERGED = wp.constant(int(Status.CONVERGED))
 HIDDEN = wp.constant(int(Status.HIDDEN))
 MAX_ITERATIONS = wp.constant(int(Status.MAX_ITERATIONS))
+GRAZING_COS = wp.constant(0.1)  # cosine of incidence below which a search without a root lies on the silhouette
 SEARCH_MIDPOINT = wp.constant(1)
 
 
@@ -406,7 +406,10 @@ def search_kernel(
     out_vertex.seed[i] = r.x
     out_vertex.residual[i] = r.residual
     if r.residual > ACCEPTED:
-        out_vertex.status[i] = wp.uint8(MAX_ITERATIONS)
+        # So close behind the silhouette that the bilinear body and the gauge disagree: as good as hidden, and the
+        # boundary's bisection ends at the vertex itself, where virtual and real point coincide.
+        grazing = wp.min(r.cos_eye, r.cos_target) < GRAZING_COS
+        out_vertex.status[i] = wp.uint8(wp.where(grazing, HIDDEN, MAX_ITERATIONS))
         out_vertex.screen[i] = wp.vec4(0.0, 0.0, -1.0, 0.0)
         return
     out_vertex.status[i] = wp.uint8(CONVERGED)
@@ -451,12 +454,6 @@ class Prepared:
         return self.map.bytes
 
 
-def part_body(scene: Scene, part: PartRange) -> Body:
-    """The triangles of a part as a body, scene frame."""
-    points, faces, _ = part_mesh(scene, part)
-    return analyse(points, faces)
-
-
 def part_mesh(scene: Scene, part: PartRange) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """(points, triangles, corner normals or None) of a part, scene frame; flat facets get no normals."""
     triangles = slice(part.first_triangle, part.first_triangle + part.triangle_count)
@@ -474,7 +471,7 @@ def part_mesh(scene: Scene, part: PartRange) -> tuple[np.ndarray, np.ndarray, np
 
 def applies(scene: Scene, reflector: Reflector) -> tuple[bool, str]:
     """A closed convex body can be held by one map."""
-    body = part_body(scene, scene.parts[reflector.part])
+    body = scene.body(reflector.part)
     if body.convex:
         return True, "closed convex body: one reflection point per vertex"
     return False, body.reason or "not convex: several reflection points per vertex"
@@ -491,7 +488,7 @@ def prepare(scene: Scene, reflector: Reflector, settings: Settings) -> Prepared:
         settings.map_resolution,
         normals=normals,
         polish=polish,
-        body=part_body(scene, part),
+        body=scene.body(reflector.part),
         device=scene.device,
     )
     return Prepared(reflector, drawn, drawn.unit_from_body)
