@@ -1,1 +1,41 @@
-"""Accurate specular reflections on curved objects for OpenUSD stages, in NVIDIA Warp."""
+"""Accurate specular reflections on curved objects for OpenUSD stages, in NVIDIA Warp, on CPU and CUDA.
+
+`load_stage` -> `make_plan` -> `render_frame` is the main path; `solve` is the bare reflection-point solver.
+"""
+
+from importlib import import_module
+
+__version__ = "0.1.0"
+
+# Name to module; imported when first asked for, so that `import warp_reflect` stays light.
+_HOME = {
+    "Camera": "layers",
+    "Frame": "frame",
+    "Plan": "planner",
+    "PlanarMirror": "solve",
+    "QuadricMirror": "solve",
+    "ReflectorMap": "reflector_maps",
+    "Scene": "scene",
+    "Settings": "settings",
+    "Solution": "solve",
+    "Status": "settings",
+    "Technique": "settings",
+    "compare_frames": "metrics",
+    "load_stage": "stage.load",
+    "make_plan": "planner",
+    "render_frame": "frame",
+    "solve": "solve",
+}
+__all__ = ["__version__", *sorted(_HOME)]
+
+
+def __getattr__(name: str):
+    if name not in _HOME:
+        raise AttributeError(f"module 'warp_reflect' has no attribute '{name}'")
+    value = getattr(import_module(f"warp_reflect.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -13,6 +13,8 @@ from functools import cached_property
 import numpy as np
 import warp as wp
 
+from warp_reflect.bodies import Body, analyse
+
 wp.set_module_options({"enable_backward": False})
 
 
@@ -237,6 +239,7 @@ class Scene:
         self.device = wp.get_device(device)
         self.notes = list(data.notes)
         self._reload = reload
+        self._bodies: dict[int, Body] = {}
         self.origin = _scene_origin(data)
         self._flatten()
 
@@ -280,6 +283,15 @@ class Scene:
         from warp_reflect import bvh
 
         return bvh.Tracer(self)
+
+    def body(self, part: int) -> Body:
+        """The triangles of a part classified as a solid, scene frame."""
+        if part not in self._bodies:
+            piece = self.parts[part]
+            first = piece.first_vertex
+            faces = self.host_triangles[piece.first_triangle : piece.first_triangle + piece.triangle_count]
+            self._bodies[part] = analyse(self.host_points[first : first + piece.vertex_count], faces - first)
+        return self._bodies[part]
 
     def _flatten(self) -> None:
         """Lay instances out one after the other in the scene frame."""

@@ -57,6 +57,7 @@ class Technique(IntEnum):
 
 
 SEARCHES = ("newton", "midpoint")
+GRID_KINDS = ("direction", "position")
 REFINEMENTS = ("exact", "off")
 
 
@@ -72,6 +73,10 @@ class Settings:
     """Residual sine at which a search stops; 0: 0.1 h^2 of the map's texel size h (below that the map is wrong)."""
     map_resolution: int = 128
     """Nodes along a cube edge of a reflector map. [nodes]"""
+    grid_share: float = 0.0
+    """Interpolation grid: solved nodes as a fraction of the vertices; 0: every vertex is searched."""
+    grid_kind: str = "direction"
+    """What the grid holds: `direction` (one exact step a vertex) or `position` (the paper's virtual positions)."""
     refine: str = "exact"
     """`exact` (every pixel gets the hit of an exact ray-triangle test) or `off` (the papers' picture)."""
     walk_hops: int = 4
@@ -89,6 +94,8 @@ class Settings:
 
     def __post_init__(self) -> None:
         _require(self.search in SEARCHES, "search", self.search, f"one of {', '.join(SEARCHES)}")
+        _require(0.0 <= self.grid_share <= 1.0, "grid_share", self.grid_share, "0 to 1")
+        _require(self.grid_kind in GRID_KINDS, "grid_kind", self.grid_kind, f"one of {', '.join(GRID_KINDS)}")
         _require(self.refine in REFINEMENTS, "refine", self.refine, f"one of {', '.join(REFINEMENTS)}")
         _require(self.complexity in COMPLEXITIES, "complexity", self.complexity, f"one of {', '.join(COMPLEXITIES)}")
         _require(0 <= self.iterations <= 1000, "iterations", self.iterations, "0 to 1000")

@@ -58,6 +58,7 @@ class VertexView:
     status: wp.array(dtype=wp.uint8)
     seed: wp.array(dtype=wp.vec3)  # what a warm start begins from; zero: nothing known
     residual: wp.array(dtype=float)
+    position: wp.array(dtype=wp.vec3)  # eye-frame virtual vertex; length 0 where nobody reads it
 
 
 @dataclass
@@ -68,12 +69,11 @@ class History:
 
 
 @wp.func
-def finish_vertex(frame: SolveFrame, camera: CameraView, p: wp.vec3, n: wp.vec3, target: wp.vec3) -> wp.vec4:
-    """Project the virtual vertex of a reflection point (unit frame)."""
+def virtual_vertex(frame: SolveFrame, p: wp.vec3, n: wp.vec3, target: wp.vec3) -> wp.vec3:
+    """Virtual vertex of a reflection point (unit frame), in the eye frame."""
     # Curvature of a body of the map's size: it only picks the form that forgives an error of p more.
     curvature = 1.0 / wp.max(wp.length(p), 1.0e-6)
-    q = virtual_point(p, n, frame.eye, target, curvature)
-    return project(camera, frame.eye_from_unit * (q - frame.eye))
+    return frame.eye_from_unit * (virtual_point(p, n, frame.eye, target, curvature) - frame.eye)
 
 
 @wp.kernel
@@ -245,16 +245,24 @@ def reflect(
     return layer
 
 
+def empty_vertices(count: int, device, with_position: bool = False) -> VertexView:
+    """Per-vertex results before a solver ran: nothing has a picture."""
+    vertices = VertexView()
+    vertices.screen = wp.full(count, wp.vec4(0.0, 0.0, raster.DROPPED, 0.0), dtype=wp.vec4, device=device)
+    vertices.status = wp.zeros(count, dtype=wp.uint8, device=device)
+    vertices.residual = wp.zeros(count, dtype=float, device=device)
+    vertices.seed = wp.zeros(count, dtype=wp.vec3, device=device)
+    vertices.position = wp.zeros(count if with_position else 0, dtype=wp.vec3, device=device)
+    return vertices
+
+
 def _vertices(scene: Scene, history: History | None) -> tuple[VertexView, bool]:
     """Fresh per-vertex results; seeds of the previous frame where they are of the same scene."""
-    count = scene.vertex_count
-    vertices = VertexView()
-    vertices.screen = wp.full(count, wp.vec4(0.0, 0.0, raster.DROPPED, 0.0), dtype=wp.vec4, device=scene.device)
-    vertices.status = wp.zeros(count, dtype=wp.uint8, device=scene.device)
-    vertices.residual = wp.zeros(count, dtype=float, device=scene.device)
-    warm = history is not None and len(history.seed) == count and history.seed.device == scene.device
-    # Copied: the previous frame keeps its own answer.
-    vertices.seed = wp.clone(history.seed) if warm else wp.zeros(count, dtype=wp.vec3, device=scene.device)
+    vertices = empty_vertices(scene.vertex_count, scene.device)
+    warm = history is not None and len(history.seed) == scene.vertex_count and history.seed.device == scene.device
+    if warm:
+        # Copied: the previous frame keeps its own answer.
+        vertices.seed = wp.clone(history.seed)
     return vertices, warm
 
 

@@ -20,12 +20,13 @@ import warp as wp
 
 from warp_reflect.cubemap import max_abs, project_to_cube
 from warp_reflect.launch import launch
-from warp_reflect.layers import Camera, CameraView, GBuffer, MirrorPixels, ReflectionLayer, Reflector
+from warp_reflect.layers import Camera, CameraView, GBuffer, MirrorPixels, ReflectionLayer, Reflector, project
 from warp_reflect.reflector_maps import MapSample, ReflectorMap, ReflectorMapView, sample_map
 from warp_reflect.scene import PartRange, Scene
 from warp_reflect.settings import Settings, Status, Technique
-from warp_reflect.techniques import forward
-from warp_reflect.techniques.forward import SolveFrame, VertexView, finish_vertex
+from warp_reflect.techniques import forward, grid
+from warp_reflect.techniques.forward import SolveFrame, VertexView, virtual_vertex
+from warp_reflect.techniques.grid import GridView, corner_weight
 
 wp.set_module_options({"enable_backward": False})
 
@@ -38,6 +39,7 @@ NEWTON_EVALUATIONS = 12  # cold starts need 3-6; what is left after 12 takes the
 MIDPOINT_ITERATIONS = 9  # the paper's best setting (figure 8)
 STEP_CAP = wp.constant(0.7)  # of the whitened radius; keeps a Newton step on the visible side
 RETRY_SHRINK = wp.constant(0.4)
+GRID_RESIDUAL_MAX = wp.constant(0.1)  # of an interpolated direction; one step squares it to below 1e-2 of itself
 SHRINK_MIN = wp.constant(1.0e-3)  # a step shortened to this share lowers nothing any more
 NORMAL_PART_MIN = wp.constant(1.0e-3)  # of |o + v|; below it the residual's tangent is not trusted
 SPD_SHARE = wp.constant(0.05)  # det J below this share of det H: take the safe step
@@ -214,6 +216,16 @@ def newton_step(s: MapSample, eye: wp.vec3, target: wp.vec3) -> wp.vec3:
 
 
 @wp.func
+def step_on_cube(map: ReflectorMapView, r: SearchResult, step: wp.vec3, shrink: float) -> wp.vec3:
+    """The cube point a tangential step leads to, capped so that it stays on its side of the body."""
+    whitened = wp.cw_mul(r.p, map.inv_extent)
+    move = wp.cw_mul(step, map.inv_extent)
+    cap = wp.min(1.0, STEP_CAP * wp.length(whitened) / wp.max(wp.length(move), 1.0e-30))
+    # From the cube point, not from the bilinear position, whose own direction is off by h^2.
+    return project_to_cube(r.x * max_abs(whitened) + move * (cap * shrink))
+
+
+@wp.func
 def coarse_seed(map: ReflectorMapView, eye: wp.vec3, target: wp.vec3) -> wp.vec3:
     """The best of a coarse set of directions: the fallback of a search that ended far from a root."""
     best = float(1.0e30)
@@ -274,11 +286,7 @@ def search_newton(
         elif shrink < SHRINK_MIN:
             break
         else:
-            whitened = wp.cw_mul(best.p, map.inv_extent)
-            move = wp.cw_mul(step, map.inv_extent)
-            cap = wp.min(1.0, STEP_CAP * wp.length(whitened) / wp.max(wp.length(move), 1.0e-30))
-            # From the cube point, not from the bilinear position, whose own direction is off by h^2.
-            x = project_to_cube(best.x * max_abs(whitened) + move * (cap * shrink))
+            x = step_on_cube(map, best, step, shrink)
     best.evaluations = used
     return best
 
@@ -372,6 +380,42 @@ def search(
     return search_newton(map, eye, target, seed, settings.iterations, settings.tolerance)
 
 
+@wp.func
+def solve_vertex(
+    map: ReflectorMapView,
+    frame: SolveFrame,
+    camera: CameraView,
+    settings: SearchSettings,
+    target: wp.vec3,
+    warm_seed: wp.vec3,
+    i: int,
+    out_vertex: VertexView,
+):
+    """Full solution of one vertex into entry i."""
+    out_vertex.seed[i] = wp.vec3(0.0, 0.0, 0.0)
+    out_vertex.screen[i] = wp.vec4(0.0, 0.0, -1.0, 0.0)
+    if not is_visible(map, frame.eye, target):
+        out_vertex.status[i] = wp.uint8(HIDDEN)
+        return
+    seed = warm_seed
+    if max_abs(seed) == 0.0:
+        seed = first_guess(map, frame.eye, target)
+    r = search(map, frame.eye, target, seed, settings)
+    out_vertex.seed[i] = r.x
+    out_vertex.residual[i] = r.residual
+    if r.residual > ACCEPTED:
+        # So close behind the silhouette that the bilinear body and the gauge disagree: as good as hidden, and the
+        # boundary's bisection ends at the vertex itself, where virtual and real point coincide.
+        grazing = wp.min(r.cos_eye, r.cos_target) < GRAZING_COS
+        out_vertex.status[i] = wp.uint8(wp.where(grazing, HIDDEN, MAX_ITERATIONS))
+        return
+    out_vertex.status[i] = wp.uint8(CONVERGED)
+    q = virtual_vertex(frame, r.p, r.n, target)
+    out_vertex.screen[i] = project(camera, q)
+    if out_vertex.position.shape[0] > 0:
+        out_vertex.position[i] = q
+
+
 @wp.kernel
 def search_kernel(
     first: int,
@@ -393,27 +437,80 @@ def search_kernel(
     if i >= own_first and i < own_first + own_count:
         return
     target = frame.unit_from_scene * points[i] + frame.unit_offset
-    if not is_visible(map, frame.eye, target):
-        out_vertex.status[i] = wp.uint8(HIDDEN)
-        out_vertex.screen[i] = wp.vec4(0.0, 0.0, -1.0, 0.0)
-        return
     seed = wp.vec3(0.0, 0.0, 0.0)
     if warm != 0:
         seed = out_vertex.seed[i]
-    if max_abs(seed) == 0.0:
-        seed = first_guess(map, frame.eye, target)
-    r = search(map, frame.eye, target, seed, settings)
-    out_vertex.seed[i] = r.x
-    out_vertex.residual[i] = r.residual
-    if r.residual > ACCEPTED:
-        # So close behind the silhouette that the bilinear body and the gauge disagree: as good as hidden, and the
-        # boundary's bisection ends at the vertex itself, where virtual and real point coincide.
-        grazing = wp.min(r.cos_eye, r.cos_target) < GRAZING_COS
-        out_vertex.status[i] = wp.uint8(wp.where(grazing, HIDDEN, MAX_ITERATIONS))
+    solve_vertex(map, frame, camera, settings, target, seed, i, out_vertex)
+
+
+@wp.kernel
+def grid_kernel(
+    first: int,
+    # Scene:
+    points: wp.array(dtype=wp.vec3),
+    own_first: int,
+    own_count: int,
+    # Reflector:
+    map: ReflectorMapView,
+    frame: SolveFrame,
+    camera: CameraView,
+    settings: SearchSettings,
+    # Grid:
+    grid_view: GridView,
+    node: VertexView,
+    interpolate_positions: int,
+    # Outputs:
+    out_vertex: VertexView,
+):
+    """One thread per scene vertex: interpolated from its cell's solved corners, or solved where that is unsafe."""
+    i = first + wp.tid()
+    if i >= own_first and i < own_first + own_count:
+        return
+    target = frame.unit_from_scene * points[i] + frame.unit_offset
+    cell = grid_view.vertex_cell[i]
+    x = wp.vec3(0.0, 0.0, 0.0)
+    position = wp.vec3(0.0, 0.0, 0.0)
+    solved = int(0)
+    hidden = int(0)
+    if cell >= 0:
+        local = grid_view.vertex_local[i]
+        for k in range(8):
+            corner = grid_view.cell_nodes[cell, k]
+            status = int(node.status[corner])
+            if status == CONVERGED:
+                solved += 1
+                weight = corner_weight(local, k)
+                seed = node.seed[corner]
+                x += weight * seed
+                if interpolate_positions != 0:
+                    position += weight * node.position[corner]
+            elif status == HIDDEN:
+                hidden += 1
+    if hidden == 8:
+        # What lies behind a convex body is convex: so does the whole cell.
+        out_vertex.status[i] = wp.uint8(HIDDEN)
         out_vertex.screen[i] = wp.vec4(0.0, 0.0, -1.0, 0.0)
         return
-    out_vertex.status[i] = wp.uint8(CONVERGED)
-    out_vertex.screen[i] = finish_vertex(frame, camera, r.p, r.n, target)
+    if solved == 8:
+        if interpolate_positions != 0:
+            out_vertex.status[i] = wp.uint8(CONVERGED)
+            out_vertex.screen[i] = project(camera, position)
+            return
+        x = project_to_cube(x)
+        sample = sample_map(map, x)
+        r = measure(sample, x, frame.eye, target)
+        if r.residual < GRID_RESIDUAL_MAX:
+            x = step_on_cube(map, r, newton_step(sample, frame.eye, target), 1.0)
+            # Read again: a tangent step leaves the body by its sagitta, which coarse cells make visible.
+            sample = sample_map(map, x)
+            r = measure(sample, x, frame.eye, target)
+            if r.residual < ACCEPTED:
+                out_vertex.seed[i] = x
+                out_vertex.residual[i] = r.residual
+                out_vertex.status[i] = wp.uint8(CONVERGED)
+                out_vertex.screen[i] = project(camera, virtual_vertex(frame, r.p, r.n, target))
+                return
+    solve_vertex(map, frame, camera, settings, target, wp.vec3(0.0, 0.0, 0.0), i, out_vertex)
 
 
 @wp.kernel
@@ -448,6 +545,7 @@ class Prepared:
     reflector: Reflector
     map: ReflectorMap
     unit_from_scene: np.ndarray  # float64 [4, 4]
+    grid: grid.Grid | None = None
 
     @property
     def bytes(self) -> int:
@@ -491,7 +589,8 @@ def prepare(scene: Scene, reflector: Reflector, settings: Settings) -> Prepared:
         body=scene.body(reflector.part),
         device=scene.device,
     )
-    return Prepared(reflector, drawn, drawn.unit_from_body)
+    cells = grid.build(scene, part, settings.grid_share) if settings.grid_share > 0.0 else None
+    return Prepared(reflector, drawn, drawn.unit_from_body, cells)
 
 
 class _Polish:
@@ -570,24 +669,21 @@ def reflect(
     part = scene.parts[prepared.reflector.part]
     chosen = search_settings(settings, prepared.map.resolution)
 
+    mirror = [part.first_vertex, part.vertex_count, prepared.map.view]
+
     def solve_vertices(frame: SolveFrame, warm: bool, out_vertex: VertexView) -> None:
-        launch(
-            search_kernel,
-            scene.vertex_count,
-            [
-                scene.view.points,
-                part.first_vertex,
-                part.vertex_count,
-                prepared.map.view,
-                frame,
-                gbuffer.view,
-                chosen,
-                int(warm),
-                out_vertex,
-            ],
-            scene.device,
-            settings.threads,
-        )
+        common = [frame, gbuffer.view, chosen]
+        cells = prepared.grid
+        if cells is None:
+            inputs = [scene.view.points, *mirror, *common, int(warm), out_vertex]
+            launch(search_kernel, scene.vertex_count, inputs, scene.device, settings.threads)
+            return
+        positions = settings.grid_kind == "position"
+        node = forward.empty_vertices(cells.node_count, scene.device, with_position=positions)
+        inputs = [cells.view.nodes, 0, 0, prepared.map.view, *common, 0, node]
+        launch(search_kernel, cells.node_count, inputs, scene.device, settings.threads)
+        inputs = [scene.view.points, *mirror, *common, cells.view, node, int(positions), out_vertex]
+        launch(grid_kernel, scene.vertex_count, inputs, scene.device, settings.threads)
 
     def solve_boundary(frame: SolveFrame, edges: wp.array, out_point: wp.array) -> None:
         launch(

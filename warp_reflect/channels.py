@@ -1,0 +1,136 @@
+"""The data channels of a frame: their names, and what the reflection layers put into them."""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+
+from warp_reflect.launch import launch
+from warp_reflect.layers import CameraView, GBuffer, ReflectionLayer, eye_ray_origin
+from warp_reflect.optics import specular_residual
+from warp_reflect.scene import Scene, SceneView
+from warp_reflect.settings import Status
+
+wp.set_module_options({"enable_backward": False})
+
+CONVERGED = wp.constant(int(Status.CONVERGED))
+
+# Group name to its components ("" for a single channel of the group's own name).
+CHANNELS = {
+    "RGBA": ("R", "G", "B", "A"),
+    "Z": ("",),
+    "N": (".X", ".Y", ".Z"),
+    "primId": ("",),
+    "reflectorId": ("",),
+    "reflectedId": ("",),
+    "reflection": (".R", ".G", ".B"),
+    "mirrorPoint": (".X", ".Y", ".Z"),
+    "reflectedPoint": (".X", ".Y", ".Z"),
+    "pathLength": ("",),
+    "reflectionMotion": (".X", ".Y"),
+    "residual": ("",),
+    "status": ("",),
+    "method": ("",),
+}
+POINTS = ("mirrorPoint", "reflectedPoint")  # world points, known relative to the eye
+
+
+@wp.kernel
+def reflection_channels_kernel(
+    first: int,
+    scene: SceneView,
+    camera: CameraView,
+    method: int,
+    # Mirror pixels:
+    pixel: wp.array(dtype=int),
+    point: wp.array(dtype=wp.vec3),
+    normal: wp.array(dtype=wp.vec3),
+    direction: wp.array(dtype=wp.vec3),
+    # Layer:
+    triangle: wp.array(dtype=int),
+    distance: wp.array(dtype=float),
+    status: wp.array(dtype=wp.uint8),
+    # Outputs:
+    out_mirror_point: wp.array(dtype=wp.vec3),
+    out_reflected_point: wp.array(dtype=wp.vec3),
+    out_reflected_id: wp.array(dtype=float),
+    out_path_length: wp.array(dtype=float),
+    out_residual: wp.array(dtype=float),
+    out_status: wp.array(dtype=float),
+    out_method: wp.array(dtype=float),
+):
+    """One thread per mirror pixel of a layer; points relative to the eye."""
+    i = first + wp.tid()
+    p = pixel[i]
+    row = p / camera.width
+    mirror = point[i] - camera.eye
+    out_mirror_point[p] = mirror
+    out_status[p] = float(int(status[i]))
+    out_method[p] = float(method)
+    if triangle[i] < 0:
+        return
+    reflected = mirror + distance[i] * direction[i]
+    origin = eye_ray_origin(camera, float(p - row * camera.width) + 0.5, float(row) + 0.5)
+    out_reflected_point[p] = reflected
+    out_reflected_id[p] = float(scene.patches[scene.triangle_patch[triangle[i]]].prim)
+    out_path_length[p] = wp.length(mirror - origin) + distance[i]
+    out_residual[p] = specular_residual(mirror, normal[i], origin, reflected)
+
+
+def reflection_channels(
+    scene: Scene, gbuffer: GBuffer, layers: dict[int, ReflectionLayer], threads: int = 0
+) -> dict[str, np.ndarray]:
+    """The channels of all layers as float32 images, 0 where there is no reflection.
+
+    Returns:
+        `mirrorPoint`, `reflectedPoint` [height, width, 3], relative to the eye, world axes, scene units;
+        `reflectedId`, `pathLength`, `residual`, `status`, `method` [height, width].
+    """
+    width, height = gbuffer.camera.size
+    device = scene.device
+    points = {name: wp.zeros(width * height, dtype=wp.vec3, device=device) for name in POINTS}
+    names = ("reflectedId", "pathLength", "residual", "status", "method")
+    values = {name: wp.zeros(width * height, dtype=float, device=device) for name in names}
+    for layer in layers.values():
+        pixels = layer.pixels
+        launch(
+            reflection_channels_kernel,
+            pixels.count,
+            [scene.view, gbuffer.view, layer.method]
+            + [pixels.pixel, pixels.point, pixels.normal, pixels.direction]
+            + [layer.triangle, layer.distance, layer.status]
+            + [*points.values(), *values.values()],
+            device,
+            threads,
+        )
+    result = {name: array.numpy().reshape(height, width, 3) for name, array in points.items()}
+    result.update({name: array.numpy().reshape(height, width) for name, array in values.items()})
+    return result
+
+
+def known_names() -> list[str]:
+    """Every name that `Frame.__getitem__` accepts."""
+    names = []
+    for group, parts in CHANNELS.items():
+        names.append(group)
+        names += [_full_name(group, part) for part in parts if part]
+    return names
+
+
+def _full_name(group: str, part: str) -> str:
+    return part if group == "RGBA" else group + part
+
+
+def component_of(name: str) -> tuple[str, int | None]:
+    """(group, component index or None for the whole group) of a channel name.
+
+    Raises:
+        KeyError: an unknown name; the message lists the known ones.
+    """
+    if name in CHANNELS:
+        return name, None
+    for group, parts in CHANNELS.items():
+        for k, part in enumerate(parts):
+            if part and name == _full_name(group, part):
+                return group, k
+    raise KeyError(f"unknown channel '{name}'; known: {', '.join(known_names())}")

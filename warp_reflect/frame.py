@@ -1,0 +1,197 @@
+"""One frame: the eye view, every reflector by its planned technique, shading. `render_frame` reads as the method."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections import Counter
+from functools import cached_property
+
+import numpy as np
+
+from warp_reflect import __version__, images, raster, shade, surface
+from warp_reflect.channels import CHANNELS, POINTS, component_of, known_names, reflection_channels
+from warp_reflect.layers import Camera, GBuffer, ReflectionLayer
+from warp_reflect.planner import Plan, find_camera
+from warp_reflect.scene import Scene
+from warp_reflect.techniques import TECHNIQUES
+from warp_reflect.timing import StageTimer
+
+
+class Frame:
+    """A finished frame; its channels are computed when they are first asked for.
+
+    Attributes:
+        scene, plan, camera: What it was made from.
+        gbuffer: What the eye sees.
+        layers: Reflector id to its `ReflectionLayer`.
+        statistics: Counts over all reflectors: pixels settled by `candidate`, `walk`, `empty`, `bvh`; vertices; ...
+        timings: Milliseconds per stage.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        plan: Plan,
+        gbuffer: GBuffer,
+        layers: dict[int, ReflectionLayer],
+        picture: tuple,
+        timings: dict[str, float],
+    ):
+        self.scene, self.plan, self.gbuffer, self.layers = scene, plan, gbuffer, layers
+        self.camera: Camera = gbuffer.camera
+        self.timings = timings
+        self._picture = picture
+        self.statistics = dict(sum((Counter(layer.statistics) for layer in layers.values()), Counter()))
+
+    @property
+    def prims(self) -> dict[int, str]:
+        """`primId` and `reflectedId` to prim path."""
+        return self.scene.prims
+
+    @property
+    def reflectors(self) -> dict[int, str]:
+        """`reflectorId` to the path of the mirror's prim."""
+        return {row.reflector.id: row.path for row in self.plan.rows}
+
+    def keys(self) -> list[str]:
+        """Every channel group, in the order they are written."""
+        return list(CHANNELS)
+
+    def __contains__(self, name: str) -> bool:
+        return name in known_names()
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """A channel, float32 [height, width] or [height, width, n].
+
+        Args:
+            name: A group such as `N`, `reflectedPoint`, `RGBA`, or one component such as `N.X`, `R`.
+
+        Raises:
+            KeyError: an unknown name; the message lists the known ones.
+        """
+        group, component = component_of(name)
+        image = self._group(group)
+        if group in POINTS:
+            there = (self._reflection["status"] > 0) if group == "mirrorPoint" else self["reflectedId"] > 0
+            world = image.astype(np.float64) + self.camera.eye
+            image = np.where(there[..., None], world, 0.0).astype(np.float32)
+        return image if component is None else image[..., component]
+
+    def relative(self, name: str) -> np.ndarray:
+        """`mirrorPoint` or `reflectedPoint` relative to the eye, world axes: exact at any offset of the stage.
+
+        Raises:
+            KeyError: another name.
+        """
+        group, component = component_of(name)
+        if group not in POINTS:
+            raise KeyError(f"'{name}' is no point; relative to the eye are {', '.join(POINTS)}")
+        image = self._group(group)
+        return image if component is None else image[..., component]
+
+    def write(self, path: str | os.PathLike, channels: list[str] | None = None) -> None:
+        """Write the frame: .exr with data channels and the plan in its header, .png with the picture in sRGB.
+
+        Args:
+            path: Where; written to a temporary name and renamed.
+            channels: Groups or components for an EXR; None: all.
+
+        Raises:
+            KeyError: an unknown channel.
+            ValueError: an extension other than .exr and .png.
+            OSError: the file could not be written.
+        """
+        images.check_writable(path)
+        if os.fspath(path).lower().endswith(".png"):
+            images.write_png(path, self["RGBA"][..., :3])
+            return
+        data = {name: self[name] for name in (channels or CHANNELS)}
+        images.write_exr(path, data, attributes=self._header())
+
+    def _header(self) -> dict:
+        return {
+            "warp_reflect:version": __version__,
+            "warp_reflect:eye": [float(x) for x in self.camera.eye],
+            "warp_reflect:prims": {str(number): path for number, path in self.prims.items()},
+            "warp_reflect:reflectors": {str(number): path for number, path in self.reflectors.items()},
+            "warp_reflect:settings": dataclasses.asdict(self.plan.settings),
+            "warp_reflect:plan": self.plan.to_json(),
+        }
+
+    def _group(self, group: str) -> np.ndarray:
+        width, height = self.camera.size
+        if group == "RGBA":
+            return self._picture[0].numpy().reshape(height, width, 4)
+        if group == "reflection":
+            return self._picture[1].numpy().reshape(height, width, 3)
+        if group == "reflectorId":
+            return self.gbuffer.reflector_id.numpy().reshape(height, width).astype(np.float32)
+        if group == "reflectionMotion":
+            return np.zeros((height, width, 2), np.float32)
+        if group in self._direct:
+            image = self._direct[group].numpy().astype(np.float32)
+            return image.reshape((height, width, 3) if group == "N" else (height, width))
+        return self._reflection[group]
+
+    @cached_property
+    def _direct(self) -> dict:
+        return surface.surface_channels(self.scene, self.gbuffer, self.plan.settings.threads)
+
+    @cached_property
+    def _reflection(self) -> dict[str, np.ndarray]:
+        return reflection_channels(self.scene, self.gbuffer, self.layers, self.plan.settings.threads)
+
+
+def render_frame(
+    scene: Scene, plan: Plan, camera: str | Camera | None = None, previous: Frame | None = None
+) -> Frame:
+    """Render a scene as planned.
+
+    Args:
+        scene: The plan's scene, or the same stage at another time.
+        plan: From `make_plan`; keeps what its techniques prepare.
+        camera: Another camera than the plan's; None: the plan's.
+        previous: The last frame; searches start from its reflection points.
+
+    Returns:
+        A `Frame`.
+    """
+    timer = StageTimer(scene.device)
+    settings = plan.settings
+    view = plan.camera if camera is None else find_camera(scene, camera, plan.size)
+    with timer("raster"):
+        gbuffer = raster.draw_scene(scene, view, settings.threads)
+    with timer("mirror_pixels"):
+        parts = {row.reflector.id: row.reflector.part for row in plan.rows}
+        pixels, gbuffer.reflector_id = surface.mirror_pixels(scene, gbuffer, parts, settings.threads)
+    layers = {}
+    for row in plan.rows:
+        if pixels[row.reflector.id].count == 0:
+            continue
+        with timer("prepare"):
+            prepared = plan.prepared(row)
+        with timer("reflect"):
+            layers[row.reflector.id] = TECHNIQUES[row.technique].reflect(
+                scene,
+                prepared,
+                gbuffer,
+                pixels[row.reflector.id],
+                view,
+                row.settings,
+                _history(previous, scene, row.reflector.id),
+            )
+    with timer("shade"):
+        picture = shade.shade(scene, gbuffer, layers, settings.threads)
+    timings = timer.ms
+    for layer in layers.values():
+        for step, ms in layer.timings.items():
+            timings["reflect/" + step] = timings.get("reflect/" + step, 0.0) + ms
+    return Frame(scene, plan, gbuffer, layers, picture, timings)
+
+
+def _history(previous: Frame | None, scene: Scene, reflector: int):
+    """What a reflector's search may start from: the previous frame's answers for the same scene."""
+    if previous is None or previous.scene is not scene or reflector not in previous.layers:
+        return None
+    return previous.layers[reflector].history

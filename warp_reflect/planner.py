@@ -1,0 +1,306 @@
+"""What a scene calls for, and why: `make_plan` decides once, everything later reads the `Plan`."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import fnmatch
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from warp_reflect import __version__, budget, raster, surface
+from warp_reflect.layers import Camera, Reflector
+from warp_reflect.scene import Note, PartRange, Scene, reflectance
+from warp_reflect.settings import Settings
+from warp_reflect.techniques import TECHNIQUES
+
+CLEARCOAT_MIN = 0.5  # a coat from here on is a mirror of its own (design: clearcoat >= 0.5)
+METHODS = ("auto", "reference")
+REC709_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+DEFAULT_SIZE = (960, 540)  # usdrecord's default width at 16:9
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One effect of a reflector: on or off, the reason, and the numbers it was decided by."""
+
+    on: bool
+    reason: str
+    numbers: dict = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class PlanRow:
+    """What is simulated for one reflector."""
+
+    reflector: Reflector
+    path: str
+    subset: str
+    instance: str
+    technique: str
+    forced: bool
+    reason: str
+    pixels: int
+    effects: dict[str, Effect]
+    settings: Settings
+    predicted: dict[str, float]
+
+
+@dataclass
+class Plan:
+    """What a frame simulates; also the owner of what the techniques prepared.
+
+    Attributes:
+        rows: One `PlanRow` per reflector, in the order of their ids.
+        notes: What the user should know about the plan, beside the scene's own notes.
+    """
+
+    scene: Scene
+    camera: Camera
+    settings: Settings
+    method: str
+    rows: list[PlanRow]
+    notes: list[Note]
+    _prepared: dict[int, object] = field(default_factory=dict)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) of the frames. [pixels]"""
+        return self.camera.size
+
+    def prepared(self, row: PlanRow) -> object:
+        """The technique's view-independent data of a reflector, made at first use."""
+        if row.reflector.id not in self._prepared:
+            technique = TECHNIQUES[row.technique]
+            self._prepared[row.reflector.id] = technique.prepare(self.scene, row.reflector, row.settings)
+        return self._prepared[row.reflector.id]
+
+    def to_json(self) -> dict:
+        """The plan as `warp-reflect plan --json` prints it."""
+        return {
+            "version": __version__,
+            "stage": self.scene.data.source,
+            "camera": self.camera.path,
+            "size": list(self.camera.size),
+            "time": self.scene.data.time,
+            "method": self.method,
+            "reflectors": [
+                {
+                    "id": row.reflector.id,
+                    "path": row.path,
+                    "subset": row.subset,
+                    "instance": row.instance,
+                    "technique": row.technique,
+                    "forced": row.forced,
+                    "reason": row.reason,
+                    "pixels": row.pixels,
+                    "effects": {name: dataclasses.asdict(effect) for name, effect in row.effects.items()},
+                    "settings": dataclasses.asdict(row.settings),
+                    "predicted": row.predicted,
+                }
+                for row in self.rows
+            ],
+            "notes": [{"path": note.path, "text": note.text} for note in [*self.scene.notes, *self.notes]],
+        }
+
+    def __str__(self) -> str:
+        width, height = self.camera.size
+        lines = [f"{self.scene.data.source}  camera {self.camera.path}  {width}x{height}"]
+        if not self.rows:
+            lines.append("no reflector: nothing is simulated beyond the direct picture")
+        for row in self.rows:
+            name = row.path + (f"[{row.instance}]" if row.instance else "") + (f":{row.subset}" if row.subset else "")
+            forced = " (forced)" if row.forced else ""
+            lines.append(f"{row.reflector.id:3d} {name}: {row.technique}{forced}, {row.pixels} pixels, "
+                         f"{row.predicted['ms']:.1f} ms predicted")
+            lines.append(f"      {row.reason}")
+            for effect_name, effect in row.effects.items():
+                lines.append(f"      {'on ' if effect.on else 'off'} {effect_name}: {effect.reason}")
+        return "\n".join(lines)
+
+
+def make_plan(
+    scene: Scene,
+    camera: str | Camera | None = None,
+    size: tuple[int, int] = DEFAULT_SIZE,
+    settings: Settings | None = None,
+    method: str = "auto",
+    reflectors: tuple[str, ...] = (),
+) -> Plan:
+    """Decide what is simulated for every reflector of a scene.
+
+    Args:
+        scene: From `load_stage`.
+        camera: Prim path or name of a camera in the stage, or a `Camera`; None: the stage's first.
+        size: (width, height). [pixels]
+        settings: The knobs; None: the defaults.
+        method: `auto`, `reference` (every mirror traced) or a key of `TECHNIQUES`; where it does not apply the mirror is
+            traced, with a note.
+        reflectors: Glob patterns of prim paths that alone reflect; empty: what the materials say.
+
+    Raises:
+        ValueError: an unknown method, an impossible size, no such camera, or a pattern that matches no drawn prim.
+    """
+    settings = settings or Settings()
+    if method not in METHODS and method not in TECHNIQUES:
+        near = difflib.get_close_matches(method, [*METHODS, *TECHNIQUES], n=3, cutoff=0.3)
+        raise ValueError(f"unknown method '{method}'; nearest: {', '.join(near or [*METHODS, *TECHNIQUES])}")
+    view = find_camera(scene, camera, size)
+    notes: list[Note] = []
+    found = [(k, part, weight) for k, part in enumerate(scene.parts) if (weight := mirror_weight(scene, part, settings))]
+    if reflectors:
+        found = _chosen(scene, reflectors)
+    pixels = _pixel_counts(scene, view, [k for k, _, _ in found], settings)
+    rows = [
+        _row(scene, view, settings, method, number, part_index, part, weight, pixels[part_index], notes)
+        for number, (part_index, part, weight) in enumerate(found, 1)
+    ]
+    return Plan(scene, view, settings, method, rows, notes)
+
+
+def find_camera(scene: Scene, camera: str | Camera | None, size: tuple[int, int]) -> Camera:
+    """The named camera of a scene (path or unique name; None: the first) at an image size."""
+    width, height = (int(side) for side in size)
+    if not (1 <= width <= raster.GUARD and 1 <= height <= raster.GUARD):
+        raise ValueError(f"size: got {width}x{height}, expected 1 to {int(raster.GUARD)} pixels a side")
+    if isinstance(camera, Camera):
+        return dataclasses.replace(camera, size=(width, height)) if camera.size != (width, height) else camera
+    cameras = scene.data.cameras
+    if camera is None:
+        if not cameras:
+            raise ValueError("camera: the stage has none; give a Camera")
+        return Camera.from_data(cameras[0], (width, height))
+    matching = [c for c in cameras if c.path == camera or c.path.rpartition("/")[2] == camera]
+    exact = [c for c in matching if c.path == camera]
+    if len(exact or matching) != 1:
+        known = ", ".join(c.path for c in matching or cameras) or "none"
+        raise ValueError(f"camera: '{camera}' names {len(matching)} cameras; the stage has: {known}")
+    return Camera.from_data((exact or matching)[0], (width, height))
+
+
+def mirror_weight(scene: Scene, part: PartRange, settings: Settings) -> float:
+    """Luminance of a part's mirror term at normal incidence; 0 where its material is not a mirror by the settings."""
+    material = scene.data.materials[part.material]
+    f0, _ = reflectance(material)
+    weight = float(f0 @ REC709_LUMINANCE)
+    coated = material.clearcoat >= CLEARCOAT_MIN and material.clearcoat_roughness <= settings.reflector_max_roughness
+    if coated:
+        return max(weight, CLEARCOAT_MIN)
+    if material.roughness <= settings.reflector_max_roughness and weight >= settings.reflector_min_weight:
+        return weight
+    return 0.0
+
+
+def _chosen(scene: Scene, patterns: tuple[str, ...]) -> list[tuple[int, PartRange, float]]:
+    found = []
+    for pattern in patterns:
+        matching = [
+            (k, part, 1.0)
+            for k, part in enumerate(scene.parts)
+            if fnmatch.fnmatchcase(part.prim_path, pattern) or part.prim_path.startswith(pattern.rstrip("/") + "/")
+        ]
+        if not matching:
+            raise ValueError(f"reflector: '{pattern}' matches no drawn prim; give a prim path or a glob such as '/World/*'")
+        found += [row for row in matching if row[0] not in {k for k, _, _ in found}]
+    return sorted(found, key=lambda row: row[0])
+
+
+PREVIEW_SIDE = 320  # pixels; enough to count a mirror's pixels within a few per cent for the choice of technique
+
+
+def _pixel_counts(scene: Scene, camera: Camera, parts: list[int], settings: Settings) -> dict[int, int]:
+    """Pixels that show each part from the camera, counted in a small picture."""
+    if not parts or not scene.triangle_count:
+        return dict.fromkeys(parts, 0)
+    width, height = camera.size
+    shrink = max(1.0, max(width, height) / PREVIEW_SIDE)
+    small = dataclasses.replace(
+        camera,
+        size=(max(1, round(width / shrink)), max(1, round(height / shrink))),
+        fx=camera.fx / shrink,
+        fy=camera.fy / shrink,
+        cx=camera.cx / shrink,
+        cy=camera.cy / shrink,
+    )
+    triangle = raster.draw_scene(scene, small, settings.threads).triangle.numpy()
+    patches = np.bincount(
+        scene.host_triangle_patch[triangle[triangle >= 0]], minlength=len(scene.patch_shapes)
+    )
+    scale = width * height / (small.size[0] * small.size[1])
+    return {k: round(float(patches[list(scene.parts[k].patches)].sum()) * scale) for k in parts}
+
+
+def _row(scene, camera, settings, method, number, part_index, part, weight, pixels, notes) -> PlanRow:
+    reflector = Reflector(number, part_index, scene.body(part_index).convex)
+    technique, forced, reason = _technique(scene, reflector, camera, method, pixels, settings, part, notes)
+    if method == "reference":
+        settings = settings.replace(refine="off")
+    predicted = budget.predict(scene, technique, pixels, settings)
+    return PlanRow(
+        reflector,
+        part.prim_path,
+        part.subset,
+        part.instance,
+        technique,
+        forced,
+        reason,
+        pixels,
+        _effects(scene, technique, pixels, weight, settings),
+        settings,
+        predicted,
+    )
+
+
+def _technique(scene, reflector, camera, method, pixels, settings, part, notes) -> tuple[str, bool, str]:
+    """(technique, forced, reason) of a reflector."""
+    if method == "reference":
+        return "raytraced", True, "the reference: every mirror is traced"
+    if method != "auto":
+        applies, reason = _applies(scene, reflector, camera, method)
+        if applies:
+            return method, True, f"asked for; {reason}"
+        notes.append(Note(part.prim_path, f"{method} does not apply ({reason}); traced"))
+        return "raytraced", False, f"{method} was asked for but does not apply: {reason}"
+    applies, reason = _applies(scene, reflector, camera, "reflector_map")
+    if not applies:
+        return "raytraced", False, f"no reflector map: {reason}"
+    forward = budget.predict(scene, "reflector_map", pixels, settings)["ms"]
+    traced = budget.predict(scene, "raytraced", pixels, settings)["ms"]
+    if traced < forward:
+        return (
+            "raytraced",
+            False,
+            f"{reason}, but {pixels} pixels are traced in {traced:.1f} ms and "
+            f"{scene.vertex_count} vertices searched in {forward:.1f} ms (predicted)",
+        )
+    return "reflector_map", False, reason
+
+
+def _applies(scene, reflector, camera: Camera, method: str) -> tuple[bool, str]:
+    if camera.orthographic and method != "raytraced":
+        return False, "orthographic camera: there is no eye to reflect from"
+    return TECHNIQUES[method].applies(scene, reflector)
+
+
+def _effects(scene, technique, pixels, weight, settings) -> dict[str, Effect]:
+    traced = technique == "raytraced"
+    visible = pixels > 0
+    return {
+        "reflection": Effect(
+            visible,
+            f"mirror weight {weight:.2f} >= {settings.reflector_min_weight} (reflector_min_weight), {pixels} pixels"
+            if visible
+            else "not seen from the camera",
+            {"weight": weight, "pixels": pixels},
+        ),
+        "refinement": Effect(
+            visible and not traced and settings.refine == "exact",
+            "traced rays are exact already" if traced else f"refine={settings.refine}",
+        ),
+        "warm_start": Effect(
+            visible and not traced, "no search" if traced else "from the previous frame where one is given"
+        ),
+        "shadows": Effect(settings.shadows, f"shadows={settings.shadows}"),
+        "second_bounce": Effect(False, "a mirror seen in a mirror shows its base and the dome, one level deep"),
+    }
