@@ -12,6 +12,7 @@ import os
 import shutil
 import sys
 import tempfile
+import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -26,7 +27,6 @@ from cyclopts import Parameter
 from warp_reflect import images
 
 DONE, PART_WAY, IMPOSSIBLE = 0, 1, 2
-DEFAULT_ASPECT = 16.0 / 9.0  # of a picture of a stage without cameras
 NOTES_SHOWN = 40  # a stage of thousands of prims may have thousands; `plan --json` has them all
 SIDE_MAX = 32768  # pixels; what the image readers of this package accept back
 
@@ -103,15 +103,14 @@ def plan(
     with _progress() as show:
         show("reading " + stage)
         scene = _load(stage, opened, settings, device, None)
+        _refuse_dropped(scene, opened)
         show("planning")
         made = _make_plan(scene, planned, settings)
     if json_:
         print(json.dumps(made.to_json(), indent=2, allow_nan=False))
     else:
         print(made)
-    _print_notes(
-        scene.notes + [note for note in getattr(made, "notes", []) if note not in scene.notes], set()
-    )
+    _print_notes([*scene.notes, *made.notes], set())
     return DONE
 
 
@@ -146,7 +145,7 @@ def render(
     settings = _settings(planned)
     _check_method(planned.method)
     _check_size_options(planned)
-    channels = [name.strip() for name in aov.split(",")] if aov is not None else None
+    channels = _channel_names(aov) if aov is not None else None
     if frames is None:
         for name in names:
             if has_frame_pattern(name):
@@ -176,14 +175,15 @@ def render(
                 _print_notes(scene.notes, told)
                 _refuse_dropped(scene, opened)
                 show(label, frames_done=len(written) // len(names))
-                made = _make_plan(scene, planned, settings)
-                _print_notes(getattr(made, "notes", []), told)
+                if made is None or made.scene is not scene:
+                    made = _make_plan(scene, planned, settings)
+                    _print_notes(made.notes, told)
                 previous = _render_one(scene, made, previous, row, channels, written)
         except (*REFUSALS, KeyboardInterrupt) as error:
             if not written:
                 raise
-            if opened.debug and not isinstance(error, KeyboardInterrupt):
-                raise
+            if opened.debug:
+                traceback.print_exc()
             _tell(f"error: {label}: {_line(error)}")
             _tell(
                 f"kept {len(written)} finished file{'s' if len(written) > 1 else ''}: {_shortened(written)}"
@@ -200,10 +200,7 @@ def _render_one(scene, made, previous, row: list[str], channels: list[str] | Non
     frame = wr.render_frame(scene, made, previous=previous)
     rendered_ms = 1000.0 * (perf_counter() - start)
     for name in row:
-        if channels is not None and Path(name).suffix.lower() == ".exr":
-            frame.write(name, channels=channels)
-        else:
-            frame.write(name)
+        frame.write(name, channels=channels)
         written.append(name)
         width, height = made.size
         print(
@@ -214,7 +211,7 @@ def _render_one(scene, made, previous, row: list[str], channels: list[str] | Non
 
 def _statistics_line(statistics: dict) -> str:
     """`, mirror pixels 12,345: 91.2 % candidate, 8.0 % walk, 0.8 % BVH`, as far as a frame counted it."""
-    names = {"candidate": "candidate", "walk": "walk", "bvh": "BVH"}
+    names = {"candidate": "candidate", "walk": "walk", "empty": "sky", "bvh": "BVH"}
     counts = {shown: int(statistics[key]) for key, shown in names.items() if key in statistics}
     total = sum(counts.values())
     if not total:
@@ -268,7 +265,7 @@ def main(tokens: list[str] | None = None) -> int:
         return command(*bound.args, **bound.kwargs) or DONE
     except REFUSALS as error:
         if debug:
-            raise
+            traceback.print_exc()
         _tell(f"error: {_line(error)}")
         return IMPOSSIBLE
     except KeyboardInterrupt:
@@ -316,6 +313,18 @@ def _settings(planned: PlanOptions):
     if planned.complexity is not None:
         changes["complexity"] = planned.complexity
     return Settings().replace(**changes)
+
+
+def _channel_names(text: str) -> list[str]:
+    """The channels of --aov, checked before a frame is rendered for them."""
+    from warp_reflect.channels import component_of
+
+    names = list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
+    if not names:
+        raise ValueError(f"--aov: got '{text}', expected channels such as RGBA,reflectedPoint")
+    for name in names:
+        component_of(name)
+    return names
 
 
 def _check_method(method: str) -> None:
@@ -382,41 +391,23 @@ def _refuse_dropped(scene, opened: StageOptions) -> None:
 
 def _make_plan(scene, planned: PlanOptions, settings):
     import warp_reflect as wr
+    from warp_reflect.planner import find_camera
 
-    camera = find_camera(scene.data.cameras, planned.camera)
     if planned.res is not None:
         size = _size(planned.res)
     else:
-        aspect = camera.horizontal_aperture / camera.vertical_aperture if camera else DEFAULT_ASPECT
-        size = planned.image_width, min(max(round(planned.image_width / aspect), 1), SIDE_MAX)
+        path = find_camera(scene, planned.camera, (1, 1)).path
+        film = next(camera for camera in scene.data.cameras if camera.path == path)
+        height = planned.image_width * film.vertical_aperture / film.horizontal_aperture
+        size = planned.image_width, min(max(round(height), 1), SIDE_MAX)
     return wr.make_plan(
         scene,
-        camera=camera.path if camera else None,
+        camera=planned.camera,
         size=size,
         settings=settings,
         method=planned.method,
         reflectors=tuple(planned.reflector or ()),
     )
-
-
-def find_camera(cameras: list, name: str | None):
-    """The camera of a path or a unique name; without one usdrecord's `main_cam`, else the first, else None.
-
-    Raises:
-        ValueError: no such camera, or several of that name.
-    """
-    if name is None:
-        primary = [camera for camera in cameras if camera.path.rpartition("/")[2] == "main_cam"]
-        return next(iter(primary + cameras), None)
-    found = [camera for camera in cameras if camera.path == name]
-    if not found and not name.startswith("/"):
-        found = [camera for camera in cameras if camera.path.rpartition("/")[2] == name]
-    if len(found) == 1:
-        return found[0]
-    paths = ", ".join(camera.path for camera in (found or cameras)) or "none"
-    if found:
-        raise ValueError(f"--camera: '{name}' is the name of several: {paths}; give the path")
-    raise ValueError(f"--camera: no camera '{name}' in the stage; cameras: {paths}")
 
 
 def _print_notes(notes: list, told: set) -> None:

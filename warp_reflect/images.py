@@ -1,6 +1,7 @@
 """Images in and out: the only user of OpenImageIO.
 
-Arrays are `[height, width]` or `[height, width, channels]`, row 0 at the top, linear Rec.709 unless said otherwise.
+Arrays are `[height, width]` or `[height, width, channels]`, row 0 at the top, linear Rec.709 unless said
+otherwise.
 A file appears under its final name whole or not at all.
 """
 
@@ -17,24 +18,14 @@ from typing import NamedTuple
 import numpy as np
 
 FORMATS = {".exr": "openexr", ".png": "png"}  # JPEG is left out: its writer ends the process on a full disk
-COLOR_CHANNELS = frozenset(
-    {"R", "G", "B", "A", "RGB", "RGBA", "reflection"}
-)  # half in an EXR; all else is data
+COLOR_CHANNELS = frozenset({"R", "G", "B", "A", "RGB", "RGBA", "reflection"})  # half in an EXR
 HALF_MAX = 65504.0  # largest finite half
 SIZE_LIMIT_MB = 512  # decoded size above which a picture is refused: a 1 MB file can ask for 4 GB
 FRAME_LIMIT_MB = 8192  # the same for our own frames: 8K with every channel
 SIDE_LIMIT = 32768  # pixels
 
-REC709_PRIMARIES = (
-    0.64,
-    0.33,
-    0.30,
-    0.60,
-    0.15,
-    0.06,
-    0.3127,
-    0.3290,
-)  # x y of red, green, blue, white (ITU-R BT.709)
+# x and y of red, green, blue and white: ITU-R BT.709.
+REC709_PRIMARIES = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 # Primaries of the named spaces that files declare (ACES: SMPTE ST 2065-1 and S-2014-004; P3: SMPTE EG 432-1).
 NAMED_PRIMARIES = {
     "lin_ap1_scene": (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767),
@@ -53,7 +44,7 @@ class Picture(NamedTuple):
     """A picture that was read, ready to shade with."""
 
     rgb: np.ndarray
-    """float32 [height, width, 3], finite and >= 0; linear Rec.709, or as stored where `color_space` was "raw"."""
+    """float32 [height, width, 3], finite and >= 0; linear Rec.709 (as stored if `color_space` was "raw")."""
     cleaned: int
     """Samples that were NaN, infinite or negative and were replaced."""
     alpha: np.ndarray | None = None
@@ -139,16 +130,18 @@ def write_exr(
         path: Where; the format is EXR whatever the extension.
         channels: Name to array [height, width] or [height, width, n]. n components become `name.X .Y .Z`, or
             `name.R .G .B .A` where the name is in `half`; "RGB" and "RGBA" become their letters.
-        half: Names stored as half, clamped to +-65504; the others are float32.
-        attributes: Header entries. str, int and float as they are; anything else as JSON (OpenEXR through OIIO keeps
-            no float64: a JSON list does).
+        half: Names (or what stands before a point in them) stored as half, clamped to +-65504; the others are
+            float32.
+        attributes: Header entries. str, int and float as they are; anything else as JSON (OpenImageIO drops
+            float64 entries of an EXR: a JSON list keeps every digit).
 
     Returns:
-        Samples that were NaN or infinite and were replaced: in a half channel by 0 or +-65504, in a data channel by 0.
+        Samples that were NaN or infinite and were replaced: by 0 or +-65504 in a half channel, by 0 in a
+        data channel.
 
     Raises:
         ValueError: no channel, or shapes that differ.
-        OSError: the file could not be written; nothing is left under the name, and an older file there is whole.
+        OSError: the file could not be written; an older file under the name is still whole.
     """
     import OpenImageIO as oiio
 
@@ -159,10 +152,11 @@ def write_exr(
             raise ValueError(
                 f"channel '{name}': got shape {array.shape}, expected [height, width] or [.., .., n]"
             )
-        for suffix, plane in _split(name, array, name in half):
+        is_half = name in half or name.rpartition(".")[0] in half
+        for suffix, plane in _split(name, array, is_half):
             names.append(suffix)
             planes.append(plane)
-            halves.append(name in half)
+            halves.append(is_half)
     if not planes or 0 in planes[0].shape:
         raise ValueError(f"{path}: an image needs at least one channel and one pixel")
     height, width = planes[0].shape
@@ -235,8 +229,8 @@ def read_exr(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict[str, 
 
     Returns:
         (channels, attributes). `name.X .Y (.Z)` and `name.R .G .B (.A)` come back as one float32 array
-        [height, width, 2..4] under `name`; every other channel as [height, width]. Attributes that hold a JSON list
-        or object come back as such.
+        [height, width, 2..4] under `name`; every other channel as [height, width]. Attributes that hold
+        a JSON list or object come back parsed.
 
     Raises:
         OSError: no such file, not a regular file, or not whole.
@@ -264,8 +258,9 @@ def read_image(
 
     Args:
         path: Any format OpenImageIO reads; told apart by content.
-        color_space: "auto", "sRGB" or "raw", as UsdUVTexture's `sourceColorSpace`: auto decodes 8-bit pictures of 3 or
-            4 channels as sRGB, and converts float pictures that declare other primaries (ACEScg ...) to Rec.709.
+        color_space: "auto", "sRGB" or "raw", as UsdUVTexture's `sourceColorSpace`: auto decodes 8-bit
+            pictures of 3 or 4 channels as sRGB, and converts float pictures that declare other primaries
+            (ACEScg ...) to Rec.709.
         size_limit_mb: Decoded size above which the file is refused. [MB]
 
     Raises:
@@ -374,7 +369,8 @@ def _write_whole(path: Path, format_name: str, spec, pixels: np.ndarray) -> None
         output = oiio.ImageOutput.create(format_name)
         good = output.open(str(part), spec)
         if good:
-            good = output.write_image(pixels)
+            # The library refuses other memory orders without a word.
+            good = output.write_image(np.ascontiguousarray(pixels))
             good = output.close() and good
         message = output.geterror()
         del output

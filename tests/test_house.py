@@ -1,0 +1,199 @@
+"""The rules of the house: who may import whom, what `import warp_reflect` loads, what every kernel keeps to."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import warp as wp
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "warp_reflect"
+FILES = {
+    ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
+    for path in sorted(PACKAGE.rglob("*.py"))
+}
+
+# A module imports from its own floor or below. A new module belongs into this table; `x.*` is a folder.
+FLOORS = {
+    1: "settings optics shapes cubemap quadrics quadric_roots heightfield launch bodies images metrics timing",
+    2: "scene layers bvh raster shade surface channels stage stage.*",
+    3: "solve solver solve_device mirrors reflector_maps techniques techniques.* finishes finishes.*",
+    4: "planner budget frame motion sweep",
+    5: "cli viewer viewer.* pipeline",
+}
+# Where an imported library may appear, inside functions or out.
+HOMES = {
+    "pxr": ("stage",),
+    "OpenImageIO": ("images",),
+    "pyvista": ("viewer",),
+    "vtk": ("viewer",),
+    "cyclopts": ("cli",),
+    "rich": ("cli", "viewer", "pipeline"),
+    "matplotlib": ("sweep", "viewer"),
+    "trimesh": ("stage", "techniques", "viewer", "bodies", "shapes"),
+    "coacd": ("techniques", "stage"),
+    "dask": ("pipeline",),
+    "scipy": (),
+    "embreex": (),
+}
+HEAVY = (
+    "pxr",
+    "OpenImageIO",
+    "pyvista",
+    "vtk",
+    "trimesh",
+    "cyclopts",
+    "rich",
+    "matplotlib",
+    "embreex",
+    "scipy",
+)
+LINES_MAX = 900
+
+
+def floor(module: str) -> int | None:
+    """The floor of a module; None for the package itself, which hands out names of every floor."""
+    name = module.removeprefix("warp_reflect").removeprefix(".")
+    if not name:
+        return None
+    for number, names in FLOORS.items():
+        listed = names.split()
+        if name in listed or f"{name.partition('.')[0]}.*" in listed:
+            return number
+    pytest.fail(f"{module} has no floor: add it to FLOORS in {Path(__file__).name}")
+
+
+def imported_modules(module: str) -> set[str]:
+    """Every module that a file imports, at its top or in a function, by full name."""
+    tree = ast.parse(FILES[module].read_text())
+    package = module if FILES[module].name == "__init__.py" else module.rpartition(".")[0]
+    found = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                stem = package.split(".")
+                base = ".".join([*stem[: len(stem) - node.level + 1], *([base] if base else [])])
+            # `from warp_reflect import raster` imports a module, `from warp_reflect.raster import draw` a name.
+            full = {f"{base}.{alias.name}" for alias in node.names}
+            found |= full & FILES.keys()
+            if full - FILES.keys():
+                found.add(base)
+    return found
+
+
+@pytest.mark.parametrize("module", FILES)
+def test_imports_point_down_the_floors(module):
+    here = floor(module)
+    if here is None:
+        return
+    for name in imported_modules(module):
+        if name == "warp_reflect":
+            continue
+        if name.partition(".")[0] == "warp_reflect":
+            assert name in FILES, f"{module} imports {name}, which does not exist"
+            assert floor(name) <= here, f"{module} (floor {here}) imports {name} (floor {floor(name)})"
+
+
+@pytest.mark.parametrize("module", FILES)
+def test_public_face_is_used_by_faces_only(module):
+    """Below the top floor a module names the module it means: `import warp_reflect` reaches every floor."""
+    tree = ast.parse(FILES[module].read_text())
+    nodes = list(ast.walk(tree))
+    whole = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+    taken = {
+        alias.name
+        for node in nodes
+        if isinstance(node, ast.ImportFrom) and node.module == "warp_reflect" and not node.level
+        for alias in node.names
+        if f"warp_reflect.{alias.name}" not in FILES
+    }
+    if floor(module) != 5:
+        assert "warp_reflect" not in whole
+        assert taken <= {"__version__"}
+
+
+@pytest.mark.parametrize("module", FILES)
+def test_libraries_stay_in_their_homes(module):
+    name = module.removeprefix("warp_reflect").removeprefix(".")
+    for imported in {full.partition(".")[0] for full in imported_modules(module)}:
+        if imported in HOMES:
+            homes = HOMES[imported]
+            assert name.partition(".")[0] in homes, (
+                f"{module} imports {imported}; its place is {homes or 'tests'}"
+            )
+
+
+def test_import_loads_nothing_heavy():
+    script = f"import warp_reflect, sys; print([name for name in {HEAVY!r} if name in sys.modules])"
+    run = [sys.executable, "-c", script]
+    done = subprocess.run(run, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_public_names_all_exist():
+    package = importlib.import_module("warp_reflect")
+    for name in package.__all__:
+        assert getattr(package, name) is not None
+
+
+@pytest.mark.parametrize("module", FILES)
+def test_file_is_of_readable_length(module):
+    lines = FILES[module].read_text().count("\n")
+    assert lines <= LINES_MAX, f"{FILES[module].relative_to(ROOT)}: {lines} lines"
+
+
+def is_kernel(node: ast.AST) -> bool:
+    return isinstance(node, ast.FunctionDef) and any(
+        ast.unparse(decorator).startswith("wp.kernel") for decorator in node.decorator_list
+    )
+
+
+KERNEL_MODULES = [
+    module for module, path in FILES.items() if any(map(is_kernel, ast.walk(ast.parse(path.read_text()))))
+]
+
+
+@pytest.mark.parametrize("module", KERNEL_MODULES)
+def test_kernels_take_their_first_element_and_stand_at_module_scope(module):
+    tree = ast.parse(FILES[module].read_text())
+    top = {id(node) for node in tree.body}
+    for node in filter(is_kernel, ast.walk(tree)):
+        assert id(node) in top, f"{module}.{node.name} is not at module scope"
+        argument = node.args.args[0]
+        assert (argument.arg, ast.unparse(argument.annotation)) == ("first", "int"), f"{module}.{node.name}"
+        assert node.name.endswith("_kernel"), f"{module}.{node.name}"
+
+
+@pytest.mark.parametrize("module", KERNEL_MODULES)
+def test_kernel_modules_build_no_backward_pass(module):
+    assert 'wp.set_module_options({"enable_backward": False' in FILES[module].read_text()
+
+
+@pytest.mark.parametrize("module", KERNEL_MODULES)
+def test_kernels_are_launched_through_launch(module):
+    """`launch` cuts a launch over the CPU's threads; a bare `wp.launch` would start at no element."""
+    for node in ast.walk(ast.parse(FILES[module].read_text())):
+        if isinstance(node, ast.Call):
+            assert ast.unparse(node.func) not in ("wp.launch", "wp.launch_tiled"), (
+                f"{module}, line {node.lineno}"
+            )
+
+
+@pytest.mark.parametrize("module", KERNEL_MODULES)
+def test_kernels_compile_for_cuda_without_a_gpu(module, tmp_path):
+    """To PTX for the oldest and a newer architecture (compute capability 7.5 and 9.0)."""
+    kernels = importlib.import_module(module)
+    made = wp.compile_aot_module(kernels, arch=[75, 90], module_dir=tmp_path, use_ptx=True)
+    texts = [Path(path).read_text() for path in made if Path(path).suffix == ".ptx"]
+    assert len(texts) == 2
+    for name in (node.name for node in ast.walk(ast.parse(FILES[module].read_text())) if is_kernel(node)):
+        for text in texts:
+            assert name in text
