@@ -1,4 +1,4 @@
-"""The rules of the house: who may import whom, what `import warp_reflect` loads, what every kernel keeps to."""
+"""The rules of the house: who imports whom, what `import warp_reflect` loads, what every kernel keeps to."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FILES = {
 
 # A module imports from its own floor or below. A new module belongs into this table; `x.*` is a folder.
 FLOORS = {
-    1: "settings optics shapes cubemap quadrics quadric_roots heightfield launch bodies images metrics timing",
+    1: "settings launch optics shapes bodies cubemap quadrics quadric_roots heightfield images metrics timing",
     2: "scene layers bvh raster shade surface channels stage stage.*",
     3: "solve solver solve_device mirrors reflector_maps techniques techniques.* finishes finishes.*",
     4: "planner budget frame motion sweep",
@@ -81,7 +81,7 @@ def imported_modules(module: str) -> set[str]:
             if node.level:
                 stem = package.split(".")
                 base = ".".join([*stem[: len(stem) - node.level + 1], *([base] if base else [])])
-            # `from warp_reflect import raster` imports a module, `from warp_reflect.raster import draw` a name.
+            # What is imported may be a module itself, or a name in one.
             full = {f"{base}.{alias.name}" for alias in node.names}
             found |= full & FILES.keys()
             if full - FILES.keys():
