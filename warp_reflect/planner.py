@@ -16,6 +16,7 @@ from warp_reflect.settings import Settings
 from warp_reflect.techniques import TECHNIQUES
 
 CLEARCOAT_MIN = 0.5  # a coat from here on is a mirror of its own (design: clearcoat >= 0.5)
+PREFERRED = ("planar", "reflector_map")  # the exact and cheap first
 METHODS = ("auto", "reference")
 REC709_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 DEFAULT_SIZE = (960, 540)  # usdrecord's default width at 16:9
@@ -262,19 +263,23 @@ def _technique(scene, reflector, camera, method, pixels, settings, part, notes) 
             return method, True, f"asked for; {reason}"
         notes.append(Note(part.prim_path, f"{method} does not apply ({reason}); traced"))
         return "raytraced", False, f"{method} was asked for but does not apply: {reason}"
-    applies, reason = _applies(scene, reflector, camera, "reflector_map")
-    if not applies:
-        return "raytraced", False, f"no reflector map: {reason}"
-    forward = budget.predict(scene, "reflector_map", pixels, settings)["ms"]
-    traced = budget.predict(scene, "raytraced", pixels, settings)["ms"]
-    if traced < forward:
-        return (
-            "raytraced",
-            False,
-            f"{reason}, but {pixels} pixels are traced in {traced:.1f} ms and "
-            f"{scene.vertex_count} vertices searched in {forward:.1f} ms (predicted)",
-        )
-    return "reflector_map", False, reason
+    reasons = []
+    for name in PREFERRED:
+        applies, reason = _applies(scene, reflector, camera, name)
+        if not applies:
+            reasons.append(f"{name}: {reason}")
+            continue
+        forward = budget.predict(scene, name, pixels, settings)["ms"]
+        traced = budget.predict(scene, "raytraced", pixels, settings)["ms"]
+        if traced < forward:
+            return (
+                "raytraced",
+                False,
+                f"{reason}, but {pixels} pixels are traced in {traced:.1f} ms and "
+                f"{scene.vertex_count} vertices reflected in {forward:.1f} ms (predicted)",
+            )
+        return name, False, reason
+    return "raytraced", False, "; ".join(reasons)
 
 
 def _applies(scene, reflector, camera: Camera, method: str) -> tuple[bool, str]:

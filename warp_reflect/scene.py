@@ -221,6 +221,7 @@ class PartRange:
     vertex_count: int
     patches: range  # indices into Scene.patch_shapes
     world_from_object: np.ndarray
+    is_whole: bool  # no other part shares the vertices
 
 
 class Scene:
@@ -283,6 +284,13 @@ class Scene:
         from warp_reflect import bvh
 
         return bvh.Tracer(self)
+
+    @cached_property
+    def lights(self):
+        """The lights as kernels read them (`shade.LightView`), prepared at first use."""
+        from warp_reflect import shade
+
+        return shade.prepare_lights(self)
 
     def body(self, part: int) -> Body:
         """The triangles of a part classified as a solid, scene frame."""
@@ -351,6 +359,7 @@ class Scene:
                         len(mesh.points),
                         range(first_patch, len(patches)),
                         inst.world_from_object,
+                        len(mesh.parts) <= 1,
                     )
                 )
             first_vertex += len(mesh.points)

@@ -25,7 +25,7 @@ from warp_reflect.layers import (
     project,
 )
 from warp_reflect.optics import virtual_point
-from warp_reflect.scene import Scene, SceneView
+from warp_reflect.scene import PartRange, Scene, SceneView
 from warp_reflect.settings import Settings, Status
 from warp_reflect.shapes import clamp_weights, intersect_triangle
 from warp_reflect.techniques import refine
@@ -169,6 +169,11 @@ def candidate_hits_kernel(
     out_v[i] = weights[1]
     out_distance[i] = wp.length(position - point[i])
     out_status[i] = wp.uint8(CONVERGED)
+
+
+def own_vertices(part: PartRange) -> list[int]:
+    """[first, count] of the scene vertices that belong to the mirror alone and have no picture in it."""
+    return [part.first_vertex, part.vertex_count if part.is_whole else 0]
 
 
 def solve_frame(scene: Scene, camera: Camera, unit_from_scene: np.ndarray) -> SolveFrame:

@@ -669,7 +669,7 @@ def reflect(
     part = scene.parts[prepared.reflector.part]
     chosen = search_settings(settings, prepared.map.resolution)
 
-    mirror = [part.first_vertex, part.vertex_count, prepared.map.view]
+    mirror = [*forward.own_vertices(part), prepared.map.view]
 
     def solve_vertices(frame: SolveFrame, warm: bool, out_vertex: VertexView) -> None:
         common = [frame, gbuffer.view, chosen]

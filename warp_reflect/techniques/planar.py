@@ -1,0 +1,170 @@
+"""Planar mirrors: every vertex mirrored in the plane, drawn where the mirror is seen.
+
+Source: Akenine-Moller, Haines, Hoffman, "Real-Time Rendering", 3rd edition, section 9.3.1; the mirror matrix as the
+Householder form I - 2 n n^T about a point of the plane, which has no special normal (algorithms that turn the plane to an
+axis first divide by 1 + n_y). What differs: instead of an oblique near plane, triangles are cut where they cross the
+mirror's plane, where the virtual and the real point coincide; depth keeps its resolution and nothing behind shows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from warp_reflect.launch import launch
+from warp_reflect.layers import Camera, CameraView, GBuffer, MirrorPixels, ReflectionLayer, Reflector, project
+from warp_reflect.scene import PartRange, Scene
+from warp_reflect.settings import Settings, Status, Technique
+from warp_reflect.techniques import forward
+from warp_reflect.techniques.forward import SolveFrame, VertexView
+
+wp.set_module_options({"enable_backward": False})
+
+CONVERGED = wp.constant(int(Status.CONVERGED))
+HIDDEN = wp.constant(int(Status.HIDDEN))
+# Of the mirror's size: a mesh flatter than this is a plane. float32 points of a unit mesh carry 6e-8; a facet 1/100 of the
+# mirror's size that deviates by this turns the ray by 1e-3 of a degree, below a pixel.
+FLATNESS_MAX = 1.0e-6
+NORMAL_SINE_MAX = 1.0e-5  # of the angle between a shading normal and the plane's: a bent normal is a curved mirror
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """The plane's frame: unit_from_scene puts it at z = 0, the reflecting side of its winding up."""
+
+    reflector: Reflector
+    unit_from_scene: np.ndarray  # float64 [4, 4]
+    bytes: int = 0
+
+
+@wp.kernel
+def mirror_kernel(
+    first: int,
+    points: wp.array(dtype=wp.vec3),
+    own_first: int,
+    own_count: int,
+    frame: SolveFrame,
+    camera: CameraView,
+    out_vertex: VertexView,
+):
+    """One thread per scene vertex: its mirror image, if it lies on the eye's side."""
+    i = first + wp.tid()
+    if i >= own_first and i < own_first + own_count:
+        return
+    q = frame.unit_from_scene * points[i] + frame.unit_offset
+    if q[2] * wp.sign(frame.eye[2]) <= 0.0:
+        out_vertex.status[i] = wp.uint8(HIDDEN)
+        return
+    out_vertex.status[i] = wp.uint8(CONVERGED)
+    virtual = wp.vec3(q[0], q[1], -q[2])
+    out_vertex.screen[i] = project(camera, frame.eye_from_unit * (virtual - frame.eye))
+
+
+@wp.kernel
+def plane_crossing_kernel(
+    first: int,
+    points: wp.array(dtype=wp.vec3),
+    frame: SolveFrame,
+    edges: wp.array(dtype=wp.vec2i),
+    out_point: wp.array(dtype=wp.vec3),
+):
+    """One thread per edge (visible vertex, vertex behind): where it meets the plane, eye frame."""
+    i = first + wp.tid()
+    a = frame.unit_from_scene * points[edges[i][0]] + frame.unit_offset
+    b = frame.unit_from_scene * points[edges[i][1]] + frame.unit_offset
+    t = a[2] / (a[2] - b[2])
+    p = a + t * (b - a)
+    out_point[i] = frame.eye_from_unit * (wp.vec3(p[0], p[1], 0.0) - frame.eye)
+
+
+def applies(scene: Scene, reflector: Reflector) -> tuple[bool, str]:
+    """A part whose points and shading normals agree with one plane."""
+    part = scene.parts[reflector.part]
+    point, normal, size = _plane(scene, part)
+    corners = scene.host_points[_corners(scene, part)].astype(np.float64)
+    height = float(np.abs((corners - point) @ normal).max()) / size
+    if height > FLATNESS_MAX:
+        return False, f"not flat: {height:.1e} of its size off its plane (at most {FLATNESS_MAX:.0e})"
+    sine = _normal_sine(scene, part, normal)
+    if sine > NORMAL_SINE_MAX:
+        return False, f"shading normals bend by a sine of {sine:.1e} (at most {NORMAL_SINE_MAX:.0e})"
+    return True, f"flat within {height:.1e} of its size"
+
+
+def prepare(scene: Scene, reflector: Reflector, settings: Settings) -> Prepared:
+    """The plane through the mirror's points."""
+    point, normal, size = _plane(scene, scene.parts[reflector.part])
+    # Any rotation that takes the normal to +z: rows are an orthonormal basis.
+    helper = np.eye(3)[np.abs(normal).argmin()]
+    x = np.cross(helper, normal)
+    x /= np.linalg.norm(x)
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.stack([x, np.cross(normal, x), normal]) / size
+    matrix[:3, 3] = -matrix[:3, :3] @ point
+    return Prepared(reflector, matrix)
+
+
+def reflect(
+    scene: Scene,
+    prepared: Prepared,
+    gbuffer: GBuffer,
+    pixels: MirrorPixels,
+    camera: Camera,
+    settings: Settings,
+    history=None,
+) -> ReflectionLayer:
+    """Mirror every vertex, draw, refine: see `forward.reflect`."""
+    part = scene.parts[prepared.reflector.part]
+
+    def solve_vertices(frame: SolveFrame, warm: bool, out_vertex: VertexView) -> None:
+        inputs = [scene.view.points, *forward.own_vertices(part), frame, gbuffer.view, out_vertex]
+        launch(mirror_kernel, scene.vertex_count, inputs, scene.device, settings.threads)
+
+    def solve_boundary(frame: SolveFrame, edges: wp.array, out_point: wp.array) -> None:
+        inputs = [scene.view.points, frame, edges, out_point]
+        launch(plane_crossing_kernel, len(edges), inputs, scene.device, settings.threads)
+
+    return forward.reflect(
+        scene,
+        prepared.reflector,
+        Technique.PLANAR,
+        prepared.unit_from_scene,
+        solve_vertices,
+        solve_boundary,
+        gbuffer,
+        pixels,
+        camera,
+        settings,
+        history,
+    )
+
+
+def _corners(scene: Scene, part: PartRange) -> np.ndarray:
+    return scene.host_triangles[part.first_triangle : part.first_triangle + part.triangle_count]
+
+
+def _plane(scene: Scene, part: PartRange) -> tuple[np.ndarray, np.ndarray, float]:
+    """(point, unit normal, size) of the plane through a part, area weighted, scene frame."""
+    corners = scene.host_points[_corners(scene, part)].astype(np.float64)
+    middle = corners.reshape(-1, 3).mean(axis=0)
+    local = corners - middle
+    size = max(float(np.abs(local).max()), 1.0e-300)
+    facets = np.cross(local[:, 1] - local[:, 0], local[:, 2] - local[:, 0])
+    # A closed box has facets that cancel: its longest facet then says at once that it is not flat.
+    normal = facets.sum(axis=0)
+    if np.linalg.norm(normal) < 1.0e-6 * np.linalg.norm(facets, axis=1).sum():
+        normal = facets[np.linalg.norm(facets, axis=1).argmax()]
+    length = np.linalg.norm(normal)
+    normal = normal / length if length > 0.0 else np.array([0.0, 0.0, 1.0])
+    return middle, normal, size
+
+
+def _normal_sine(scene: Scene, part: PartRange, normal: np.ndarray) -> float:
+    index = scene.host_normal_index[part.first_triangle : part.first_triangle + part.triangle_count]
+    index = index[index[:, 0] >= 0]
+    if not len(index):
+        return 0.0
+    shading = scene.host_normals[np.unique(index)].astype(np.float64)
+    return float(np.linalg.norm(np.cross(shading, normal), axis=1).max())
