@@ -588,7 +588,7 @@ def test_reflect_matches_brute_force(kind):
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e4])
 @pytest.mark.parametrize("kind", ["sphere", "cylinder"])
 def test_reflect_inside_a_body_starts_beyond_its_own_facets(kind, scale):
-    """Inside a gprim the polished points lie behind the facets; every ray must still cross to the far side."""
+    """Inside a gprim the polished points lie behind the facets; rays must still cross to the far side."""
     mesh, shape = unit_quadric_mesh(kind)
     scene = scene_of((mesh, place(scale=scale)))
     camera = look_at((0.3 * scale, 0.2 * scale, 0.1 * scale), (scale, 0.1 * scale, 0), (64, 48))

@@ -61,7 +61,7 @@ class RayHit:
 
 
 @wp.struct
-class Body:
+class OwnBody:
     """The mirror that a ray starts on: a range of triangles."""
 
     first_triangle: int
@@ -116,7 +116,7 @@ def leaves_from_behind(
 
     A point polished onto a concave surface lies behind its facets, and an interpolated normal can send a
     grazing ray under its own facet. Both then cross the body from behind: the first near the start, the
-    second anywhere. The back is told by the winding and by the side that the eye sees of the start's own facet.
+    second anywhere. The back is told by the winding and by the side that the eye sees of the start's facet.
     """
     own = scene_facet_normal(scene, facet)
     incident = direction - 2.0 * wp.dot(direction, normal) * normal
@@ -142,7 +142,7 @@ def trace_ray(
     normal: wp.vec3,
     # The mirror it starts on:
     facet: int,
-    body: Body,
+    body: OwnBody,
     # Settings:
     retry: int,
 ) -> RayHit:
@@ -227,7 +227,7 @@ def trace_kernel(
 ):
     """One thread per ray from free space."""
     i = first + wp.tid()
-    hit = trace_ray(mesh_id, scene, origins[i], directions[i], wp.vec3(0.0, 0.0, 0.0), -1, Body(), 1)
+    hit = trace_ray(mesh_id, scene, origins[i], directions[i], wp.vec3(0.0, 0.0, 0.0), -1, OwnBody(), 1)
     out_triangle[i] = hit.triangle
     out_t[i] = hit.t
     out_u[i] = hit.u
@@ -245,7 +245,7 @@ def trace_pixels_kernel(
     point: wp.array(dtype=wp.vec3),
     normal: wp.array(dtype=wp.vec3),
     direction: wp.array(dtype=wp.vec3),
-    body: Body,
+    body: OwnBody,
     index: wp.array(dtype=int),
     indexed: int,
     # Outputs:
@@ -278,7 +278,7 @@ def retry_pixels_kernel(
     point: wp.array(dtype=wp.vec3),
     normal: wp.array(dtype=wp.vec3),
     direction: wp.array(dtype=wp.vec3),
-    body: Body,
+    body: OwnBody,
     index: wp.array(dtype=int),
     indexed: int,
     status: wp.array(dtype=wp.uint8),
@@ -377,9 +377,9 @@ def _vectors(values, device) -> wp.array:
     return wp.array(np.ascontiguousarray(values, np.float32), dtype=wp.vec3, device=device)
 
 
-def body_of(scene: Scene, part: int, convex: bool) -> Body:
+def body_of(scene: Scene, part: int, convex: bool) -> OwnBody:
     """The triangles of a part as the body that its own reflected rays start on; part -1: none."""
-    body = Body()
+    body = OwnBody()
     if part >= 0:
         body.first_triangle = scene.parts[part].first_triangle
         body.triangle_count = scene.parts[part].triangle_count

@@ -1,0 +1,447 @@
+"""Deferred shading: the picture from the G-buffer and the reflectors' layers.
+
+Approximates UsdPreviewSurface under dome and distant lights, without shadows:
+
+* base: Lambert under the dome's irradiance (its first nine spherical harmonics) and the distant lights;
+* mirror term: Schlick's Fresnel between F0 and F90 at the angle of incidence, and the white clear coat on top
+  of it, times the radiance from the reflected direction. At a reflector that is the surface its layer names;
+  elsewhere, and for a mirror seen in a mirror, the dome;
+* roughness: up to `SHARP_ROUGHNESS` a surface mirrors, from `ROUGH_ROUGHNESS` on its specular share is
+  reflected like Lambert's, between them it is divided linearly (a lobe's shape is not modelled); a reflector
+  mirrors whatever its roughness;
+* energy: what the clear coat and the mirror term take is taken from the layers below.
+
+Opacity is not looked at. The background is the dome; alpha is coverage.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import warp as wp
+
+from warp_reflect import launch
+from warp_reflect.layers import CameraView, GBuffer, ReflectionLayer, eye_ray_direction, eye_ray_origin
+from warp_reflect.scene import SHAPE_QUADRIC, LightData, Scene, SceneView
+from warp_reflect.shapes import clamp_weights, facet_normal, intersect_triangle, unit
+from warp_reflect.surface import shading_normal
+
+wp.set_module_options({"enable_backward": False})
+
+# The grey dome of a stage without any light: radiance at the horizon, and what is added straight up and taken
+# straight down, so that shapes can be told.
+DEFAULT_SKY = 0.5
+DEFAULT_SLOPE = 0.3
+# Up to the first a mirror image looks sharp; at the second the lobe is some 35 degrees wide.
+SHARP_ROUGHNESS = wp.constant(0.05)
+ROUGH_ROUGHNESS = wp.constant(0.3)
+PI = wp.constant(float(np.pi))
+
+
+@wp.struct
+class DomeView:
+    """A textured dome light: a latlong map in OpenEXR orientation, its pole the light's +Y."""
+
+    first_texel: int
+    width: int
+    height: int
+    color: wp.vec3
+    light_from_world: wp.mat33
+
+
+@wp.struct
+class DistantView:
+    to_light: wp.vec3  # unit
+    irradiance: wp.vec3  # on a facing surface
+
+
+@wp.struct
+class LightView:
+    """All light of a scene. Directions have world axes."""
+
+    sky: wp.vec3  # radiance of the domes without a texture
+    sky_slope: wp.vec3  # grey radiance added in proportion to the direction's component along this vector
+    domes: wp.array(dtype=DomeView)
+    texels: wp.array(dtype=wp.vec3)
+    distant: wp.array(dtype=DistantView)
+    # Irradiance of the textured domes on a surface of normal (x, y, z): a quadratic form.
+    e_1: wp.vec3
+    e_x: wp.vec3
+    e_y: wp.vec3
+    e_z: wp.vec3
+    e_xx: wp.vec3
+    e_yy: wp.vec3
+    e_zz: wp.vec3
+    e_xy: wp.vec3
+    e_yz: wp.vec3
+    e_xz: wp.vec3
+
+
+def dome_moments(texture: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Integrals of a latlong map's radiance L(d) over the sphere: of L, L d and L d d^T.
+
+    Args:
+        texture: Latlong map in OpenEXR orientation, shape [h, w, 3].
+
+    Returns:
+        float64 [3 channels], [3 channels, 3], [3 channels, 3, 3], in the light's frame.
+    """
+    height, width = texture.shape[:2]
+    edges = np.sin(np.linspace(0.5 * np.pi, -0.5 * np.pi, height + 1))
+    solid_angle = (edges[:-1] - edges[1:]) * (2.0 * np.pi / width)
+    lat = (0.5 - (np.arange(height) + 0.5) / height) * np.pi
+    lon = (1.0 - 2.0 * (np.arange(width) + 0.5) / width) * np.pi
+    # The map's rows against functions of the longitude first: five sums a row hold all moments.
+    functions = np.stack(
+        [np.ones(width), np.sin(lon), np.cos(lon), np.sin(lon) ** 2, np.sin(lon) * np.cos(lon)]
+    )
+    one, sx, cz, sxx, sxz = np.einsum("kw,hwc->khc", functions, texture.astype(np.float64), optimize=True)
+    c, s = np.cos(lat)[:, None], np.sin(lat)[:, None]
+
+    def total(rows: np.ndarray) -> np.ndarray:
+        return solid_angle @ rows
+
+    first = np.stack([total(c * sx), total(s * one), total(c * cz)], axis=-1)
+    xy, yz, xz = total(c * s * sx), total(c * s * cz), total(c * c * sxz)
+    xx, yy, zz = total(c * c * sxx), total(s * s * one), total(c * c * (one - sxx))
+    second = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=-1).reshape(3, 3, 3)
+    return total(one), first, second
+
+
+def prepare_lights(scene: Scene) -> LightView:
+    """The device form of a scene's lights; light kinds other than dome and distant are left out.
+
+    Source of the irradiance: Ramamoorthi and Hanrahan, An Efficient Representation for Irradiance Environment
+    Maps, 2001, equation 8 (cosine lobe coefficients pi, 2 pi / 3, pi / 4). Differs from it by: moments of the
+    radiance instead of spherical harmonics, which span the same functions and turn with the light as a vector
+    and a matrix do.
+    """
+    domes = [light for light in scene.data.lights if light.kind == "dome"]
+    distant = [light for light in scene.data.lights if light.kind == "distant"]
+    zeroth, first, second = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3, 3))
+    sky, sky_slope = np.zeros(3), np.zeros(3)
+    if not domes and not distant:
+        sky[:] = DEFAULT_SKY
+        sky_slope["XYZ".index(scene.data.up_axis)] = DEFAULT_SLOPE
+    dome_views, texels, texel_count = [], [], 0
+    for light in domes:
+        color = np.asarray(light.color, np.float64)
+        if light.texture is None:
+            sky += color
+            continue
+        world_from_light = _rotation(light.world_from_light)
+        m0, m1, m2 = dome_moments(light.texture)
+        zeroth += color * m0
+        first += color[:, None] * (m1 @ world_from_light.T)
+        second += color[:, None, None] * (world_from_light @ m2 @ world_from_light.T)
+        view = DomeView()
+        view.first_texel = texel_count
+        view.height, view.width = light.texture.shape[:2]
+        view.color = wp.vec3(*color)
+        view.light_from_world = wp.mat33(world_from_light.T.astype(np.float32))
+        dome_views.append(view)
+        texels.append(np.ascontiguousarray(light.texture, np.float32).reshape(-1, 3))
+        texel_count += len(texels[-1])
+
+    lights = LightView()
+    device = scene.device
+    lights.sky = wp.vec3(*sky)
+    lights.sky_slope = wp.vec3(*sky_slope)
+    lights.domes = wp.array(dome_views, dtype=DomeView, device=device)
+    lights.texels = wp.array(
+        np.concatenate(texels) if texels else np.zeros((0, 3), np.float32), dtype=wp.vec3, device=device
+    )
+    lights.distant = wp.array([_distant_view(light) for light in distant], dtype=DistantView, device=device)
+    # E(n) = sum over l of A_l (2 l + 1) / (4 pi) * integral of L(d) P_l(n . d), A = (pi, 2 pi / 3, pi / 4).
+    linear, quadratic = 0.5 * first, 15.0 / 32.0 * second
+    lights.e_1 = wp.vec3(*((1.0 / 4.0 - 5.0 / 32.0) * zeroth))
+    lights.e_x, lights.e_y, lights.e_z = (wp.vec3(*linear[:, k]) for k in range(3))
+    lights.e_xx, lights.e_yy, lights.e_zz = (wp.vec3(*quadratic[:, k, k]) for k in range(3))
+    lights.e_xy = wp.vec3(*(2.0 * quadratic[:, 0, 1]))
+    lights.e_yz = wp.vec3(*(2.0 * quadratic[:, 1, 2]))
+    lights.e_xz = wp.vec3(*(2.0 * quadratic[:, 0, 2]))
+    return lights
+
+
+def _rotation(matrix: np.ndarray) -> np.ndarray:
+    """The rotation of a light's transform: its axes at unit length."""
+    axes = np.asarray(matrix, np.float64)[:3, :3]
+    return axes / np.linalg.norm(axes, axis=0)
+
+
+def _distant_view(light: LightData) -> DistantView:
+    view = DistantView()
+    view.to_light = wp.vec3(*_rotation(light.world_from_light)[:, 2])
+    view.irradiance = wp.vec3(*light.color)
+    return view
+
+
+@wp.func
+def map_radiance(lights: LightView, dome: DomeView, direction: wp.vec3) -> wp.vec3:
+    """Bilinear look-up of a latlong map; wraps around the pole's axis, ends at the poles."""
+    d = dome.light_from_world * direction
+    lon = wp.atan2(d[0], d[2])
+    lat = wp.asin(wp.clamp(d[1], -1.0, 1.0))
+    x = (0.5 - lon / (2.0 * PI)) * float(dome.width) - 0.5
+    y = wp.clamp((0.5 - lat / PI) * float(dome.height) - 0.5, 0.0, float(dome.height - 1))
+    x_floor = wp.floor(x)
+    fx = x - x_floor
+    x0 = int(x_floor)
+    if x0 < 0:
+        x0 += dome.width
+    x1 = x0 + 1
+    if x1 >= dome.width:
+        x1 -= dome.width
+    y0 = int(y)
+    y1 = wp.min(y0 + 1, dome.height - 1)
+    fy = y - float(y0)
+    upper = dome.first_texel + y0 * dome.width
+    lower = dome.first_texel + y1 * dome.width
+    top = (1.0 - fx) * lights.texels[upper + x0] + fx * lights.texels[upper + x1]
+    bottom = (1.0 - fx) * lights.texels[lower + x0] + fx * lights.texels[lower + x1]
+    return wp.cw_mul(dome.color, (1.0 - fy) * top + fy * bottom)
+
+
+@wp.func
+def dome_radiance(lights: LightView, direction: wp.vec3) -> wp.vec3:
+    """Radiance of all domes from a unit direction."""
+    grey = wp.dot(lights.sky_slope, direction)
+    radiance = lights.sky + wp.vec3(grey, grey, grey)
+    for k in range(lights.domes.shape[0]):
+        radiance += map_radiance(lights, lights.domes[k], direction)
+    return radiance
+
+
+@wp.func
+def irradiance(lights: LightView, n: wp.vec3) -> wp.vec3:
+    """Irradiance of all lights on a surface of unit normal n."""
+    grey = (2.0 * PI / 3.0) * wp.dot(lights.sky_slope, n)
+    total = PI * lights.sky + wp.vec3(grey, grey, grey)
+    if lights.domes.shape[0] > 0:
+        e = lights.e_1 + n[0] * lights.e_x + n[1] * lights.e_y + n[2] * lights.e_z
+        e += n[0] * (n[0] * lights.e_xx + n[1] * lights.e_xy + n[2] * lights.e_xz)
+        e += n[1] * (n[1] * lights.e_yy + n[2] * lights.e_yz) + n[2] * n[2] * lights.e_zz
+        # A small bright sun drives nine coefficients below zero on its far side.
+        total += wp.vec3(wp.max(e[0], 0.0), wp.max(e[1], 0.0), wp.max(e[2], 0.0))
+    for k in range(lights.distant.shape[0]):
+        total += wp.max(wp.dot(n, lights.distant[k].to_light), 0.0) * lights.distant[k].irradiance
+    return total
+
+
+@wp.struct
+class Lobes:
+    """What a surface does with light at one point and angle: base + mirror * radiance(reflected)."""
+
+    base: wp.vec3
+    mirror: wp.vec3
+
+
+@wp.func
+def schlick(f0: wp.vec3, f90: wp.vec3, cosine: float) -> wp.vec3:
+    """Fresnel reflectance. Source: Schlick, An Inexpensive BRDF Model, 1994, equation 15, with a free F90."""
+    m = 1.0 - wp.clamp(cosine, 0.0, 1.0)
+    m2 = m * m
+    return f0 + (m2 * m2 * m) * (f90 - f0)
+
+
+@wp.func
+def split_lobes(
+    scene: SceneView,
+    lights: LightView,
+    triangle: int,
+    u: float,
+    v: float,
+    n: wp.vec3,
+    cosine: float,
+    reflector: bool,
+) -> Lobes:
+    """Base radiance and mirror weight of a surface.
+
+    `n` is its unit normal on the viewer's side, `cosine` that of the angle of incidence.
+    """
+    material = scene.patches[scene.triangle_patch[triangle]].material
+    color = scene.materials[material].base_color
+    f0 = scene.materials[material].f0
+    f90 = scene.materials[material].f90
+    coat_f0 = scene.materials[material].clearcoat_f0
+    if scene.materials[material].uses_vertex_color != 0 and scene.color_index.shape[0] > 0:
+        index = scene.color_index[triangle]
+        if index[0] >= 0:
+            color = (
+                (1.0 - u - v) * scene.colors[index[0]]
+                + u * scene.colors[index[1]]
+                + v * scene.colors[index[2]]
+            )
+            metallic = scene.materials[material].metallic
+            if metallic > 0.0:
+                dielectric = (1.0 - metallic) * coat_f0
+                f0 = wp.vec3(dielectric, dielectric, dielectric) + metallic * color
+                f90 = wp.vec3(1.0 - metallic, 1.0 - metallic, 1.0 - metallic) + metallic * color
+    sharp = wp.clamp(
+        (ROUGH_ROUGHNESS - scene.materials[material].roughness) / (ROUGH_ROUGHNESS - SHARP_ROUGHNESS),
+        0.0,
+        1.0,
+    )
+    if reflector:
+        sharp = float(1.0)
+    mirror = sharp * schlick(f0, f90, cosine)
+    blurred = (1.0 - sharp) * f0
+    # F90 is 1 for a dielectric and the colour itself for a metal: the difference reaches the diffuse layer.
+    albedo = blurred + wp.cw_mul(f90 - mirror - blurred, color)
+    coat_weight = scene.materials[material].clearcoat
+    if coat_weight > 0.0:
+        coat = coat_weight * schlick(wp.vec3(coat_f0, coat_f0, coat_f0), wp.vec3(1.0, 1.0, 1.0), cosine)[0]
+        albedo = (1.0 - coat) * albedo
+        mirror = (1.0 - coat) * mirror + wp.vec3(coat, coat, coat)
+    lobes = Lobes()
+    lobes.base = scene.materials[material].emissive + wp.cw_mul(albedo, irradiance(lights, n) / PI)
+    lobes.mirror = mirror
+    return lobes
+
+
+@wp.func
+def hit_normal(scene: SceneView, triangle: int, u: float, v: float) -> wp.vec3:
+    """Unit normal to shade with: interpolated, or of the analytic surface, or the facet's; not turned."""
+    if scene.normal_index[triangle][0] >= 0:
+        # The last argument counts where the corners' normals cancel.
+        return shading_normal(scene, triangle, u, v, wp.vec3(0.0, 0.0, 1.0))
+    tri = scene.triangles[triangle]
+    v0 = scene.points[tri[0]]
+    v1 = scene.points[tri[1]]
+    v2 = scene.points[tri[2]]
+    patch = scene.triangle_patch[triangle]
+    if scene.patches[patch].shape != SHAPE_QUADRIC:
+        return facet_normal(v0, v1, v2)
+    m = scene.patches[patch].unit_from_scene
+    q = wp.transform_point(m, (1.0 - u - v) * v0 + u * v1 + v * v2)
+    abc = scene.patches[patch].quadric
+    gradient = wp.vec3(q[0], q[1], abc[0] * q[2] + 0.5 * abc[1])
+    return unit(wp.transform_vector(wp.transpose(m), gradient))
+
+
+@wp.func
+def hit_radiance(
+    scene: SceneView, lights: LightView, triangle: int, u: float, v: float, direction: wp.vec3
+) -> wp.vec3:
+    """Radiance back along a unit ray: of the surface it hits, which mirrors only the dome, or of the dome."""
+    base = wp.vec3(0.0, 0.0, 0.0)
+    weight = wp.vec3(1.0, 1.0, 1.0)
+    onward = direction
+    if triangle >= 0:
+        n = hit_normal(scene, triangle, u, v)
+        cosine = wp.dot(n, direction)
+        onward = direction - 2.0 * cosine * n
+        if cosine > 0.0:
+            n = -n
+        lobes = split_lobes(scene, lights, triangle, u, v, n, wp.abs(cosine), False)
+        base = lobes.base
+        weight = lobes.mirror
+    if wp.max(weight) > 0.0:
+        base += wp.cw_mul(weight, dome_radiance(lights, onward))
+    return base
+
+
+@wp.kernel
+def shade_kernel(
+    first: int,
+    scene: SceneView,
+    camera: CameraView,
+    lights: LightView,
+    triangle: wp.array(dtype=int),
+    reflector_id: wp.array(dtype=int),
+    # Outputs:
+    out_picture: wp.array(dtype=wp.vec4),
+    out_mirror: wp.array(dtype=wp.vec3),
+):
+    """One thread per pixel: all but the mirror term of reflectors, whose weight is left in `out_mirror`."""
+    i = first + wp.tid()
+    row = i // camera.width
+    x = float(i - row * camera.width) + 0.5
+    y = float(row) + 0.5
+    tri = triangle[i]
+    ray = eye_ray_direction(camera, x, y)
+    incident = unit(ray)
+    base = wp.vec3(0.0, 0.0, 0.0)
+    weight = wp.vec3(1.0, 1.0, 1.0)
+    onward = incident
+    reflector = reflector_id[i] > 0
+    coverage = float(0.0)
+    if tri >= 0:
+        corner = scene.triangles[tri]
+        hit = intersect_triangle(
+            eye_ray_origin(camera, x, y),
+            ray,
+            scene.points[corner[0]] - camera.eye,
+            scene.points[corner[1]] - camera.eye,
+            scene.points[corner[2]] - camera.eye,
+        )
+        uv = clamp_weights(hit.u, hit.v)
+        n = hit_normal(scene, tri, uv[0], uv[1])
+        cosine = wp.dot(n, incident)
+        onward = incident - 2.0 * cosine * n
+        if cosine > 0.0:
+            n = -n
+        lobes = split_lobes(scene, lights, tri, uv[0], uv[1], n, wp.abs(cosine), reflector)
+        base = lobes.base
+        weight = lobes.mirror
+        coverage = float(1.0)
+    if reflector:
+        out_mirror[i] = weight
+    else:
+        out_mirror[i] = wp.vec3(0.0, 0.0, 0.0)
+        if wp.max(weight) > 0.0:
+            base += wp.cw_mul(weight, dome_radiance(lights, onward))
+    out_picture[i] = wp.vec4(base[0], base[1], base[2], coverage)
+
+
+@wp.kernel
+def mirror_term_kernel(
+    first: int,
+    scene: SceneView,
+    lights: LightView,
+    pixel: wp.array(dtype=int),
+    direction: wp.array(dtype=wp.vec3),
+    triangle: wp.array(dtype=int),
+    u: wp.array(dtype=float),
+    v: wp.array(dtype=float),
+    # Outputs:
+    out_picture: wp.array(dtype=wp.vec4),
+    out_mirror: wp.array(dtype=wp.vec3),
+):
+    """One thread per mirror pixel; finds the mirror's weight in `out_mirror`."""
+    i = first + wp.tid()
+    p = pixel[i]
+    term = wp.cw_mul(out_mirror[p], hit_radiance(scene, lights, triangle[i], u[i], v[i], direction[i]))
+    out_mirror[p] = term
+    out_picture[p] += wp.vec4(term[0], term[1], term[2], 0.0)
+
+
+def shade(
+    scene: Scene, gbuffer: GBuffer, layers: Mapping[int, ReflectionLayer], threads: int = 0
+) -> tuple[wp.array, wp.array]:
+    """The picture of a frame.
+
+    Args:
+        scene: On the G-buffer's device.
+        gbuffer: With its `reflector_id` set.
+        layers: The answer of every reflector that `reflector_id` names.
+        threads: CPU threads; 0: one per core.
+
+    Returns:
+        (linear RGB radiance and coverage, vec4 [height * width]; the reflectors' mirror term alone, vec3
+        [height * width], 0 elsewhere).
+    """
+    count = gbuffer.camera.size[0] * gbuffer.camera.size[1]
+    device = scene.device
+    lights = scene.lights
+    picture = wp.empty(count, dtype=wp.vec4, device=device)
+    mirror = wp.empty(count, dtype=wp.vec3, device=device)
+    inputs = [scene.view, gbuffer.view, lights, gbuffer.triangle, gbuffer.reflector_id, picture, mirror]
+    launch.launch(shade_kernel, count, inputs, device, threads)
+    for layer in layers.values():
+        pixels = layer.pixels
+        inputs = [scene.view, lights, pixels.pixel, pixels.direction]
+        inputs += [layer.triangle, layer.u, layer.v, picture, mirror]
+        launch.launch(mirror_term_kernel, pixels.count, inputs, device, threads)
+    return picture, mirror
