@@ -436,6 +436,18 @@ def test_mirror_pixels_lie_on_the_analytic_surface(kind, eye, orthographic, scal
     np.testing.assert_allclose(mirror.direction.numpy()[fair], want[fair], atol=2e-5 + 2 * stage)
 
 
+def test_mirror_pixels_seen_from_afar_stay_on_the_surface():
+    """A telescope: what float32 loses at the eye's distance may shift P along the surface, not off it."""
+    mesh, _ = unit_quadric_mesh("sphere")
+    scene = scene_of((mesh, place()))
+    camera = look_at((2e4, -1e4, 3e4), (0, 0, 0), fov=4e-3)
+    mirror = surface.mirror_pixels(scene, raster.draw_scene(scene, camera), {1: 0})[0][1]
+    assert mirror.count > 500
+    point, normal = mirror.point.numpy().astype(float) + scene.origin, mirror.normal.numpy()
+    np.testing.assert_allclose(np.linalg.norm(point, axis=1), 1.0, atol=2e-6)
+    np.testing.assert_allclose(normal, point, atol=2e-6)
+
+
 def test_mirror_pixels_interpolate_the_normals_of_a_mesh():
     ball = trimesh.creation.icosphere(2)
     scene = scene_of((mesh_of(ball.vertices, ball.faces, normals=ball.vertices), place(3, 2, 1, 2.0)))

@@ -13,15 +13,13 @@ import warp as wp
 
 from warp_reflect import launch
 from warp_reflect.layers import CameraView, GBuffer, MirrorPixels, eye_ray_direction, eye_ray_origin
-from warp_reflect.scene import SHAPE_NONE, SHAPE_PLANE, PatchView, Scene, SceneView
+from warp_reflect.scene import SHAPE_PLANE, SHAPE_QUADRIC, Scene, SceneView
 from warp_reflect.shapes import clamp_weights, facet_normal, intersect_triangle, max_abs, unit
 
 wp.set_module_options({"enable_backward": False})
 
 # An interpolated normal shorter than this has lost its direction (corners apart); the facet's is used.
 LEAST_NORMAL = wp.constant(0.1)
-# A ray that passes its facet this far outside (in weights) meets the facet's plane somewhere else altogether.
-LEAST_WEIGHT = wp.constant(-0.5)
 # Share of the surface's slope along the ray that the facet point must show for its sign to be trusted.
 SURE_SLOPE = wp.constant(0.5)
 
@@ -34,9 +32,6 @@ class Surface:
     p_scene: wp.vec3
     incident: wp.vec3  # unit, from the eye to the point
     normal: wp.vec3  # unit shading normal, on the eye's side
-    facet: wp.vec3  # unit normal of the facet by its winding; zero if it has no area
-    u: float  # weights of the facet's second and third corner
-    v: float
 
 
 @wp.func
@@ -52,80 +47,103 @@ def shading_normal(scene: SceneView, triangle: int, u: float, v: float, facet: w
 
 
 @wp.func
-def polish(
-    patch: PatchView,
-    p: wp.vec3,
-    direction: wp.vec3,
-    facet: wp.vec3,
-    reach: float,
-) -> wp.vec4:
-    """Move a facet point along its ray onto the analytic surface behind the facet.
+def polish(scene: SceneView, triangle: int, p: wp.vec3, direction: wp.vec3) -> wp.vec4:
+    """Move a point near a facet along its ray onto the analytic surface behind the facet.
 
-    The quadric is solved from the facet point, not from the eye: the constant term is then small and exact,
-    and so is the root. Of the two roots the one whose surface is crossed in the same sense as the facet is
-    meant; near the silhouette the other may be nearer.
+    The quadric is solved from that point, not from the eye: the constant term is then small and exact, and so
+    is the root. Of the two roots the one is meant whose surface is crossed in the same sense as the facet;
+    near the silhouette the other may be nearer.
 
     Args:
-        patch: Has a shape.
-        p: Facet point, scene frame.
+        scene: Holds the shape of the triangle's patch.
+        triangle: The facet.
+        p: On the ray near the facet, scene frame.
         direction: Of the ray, unit length.
-        facet: Unit normal of the facet.
-        reach: Bound on the distance moved. [scene units]
 
     Returns:
-        Unit normal and distance moved; a zero normal if the ray has no such root in reach.
+        Unit normal and distance moved; a zero normal if the ray has no such root near the facet.
     """
-    m = patch.unit_from_scene
+    patch = scene.triangle_patch[triangle]
+    m = scene.patches[patch].unit_from_scene
     q = wp.transform_point(m, p)
     d = wp.transform_vector(m, direction)
-    gradient = wp.vec3(0.0, 0.0, 1.0)
-    s = float(0.0)
-    if patch.shape == SHAPE_PLANE:
+    if scene.patches[patch].shape == SHAPE_PLANE:
         if d[2] == 0.0:
             return wp.vec4(0.0, 0.0, 0.0, 0.0)
-        s = -q[2] / d[2]
-    else:
-        a = patch.quadric[0]
-        b = patch.quadric[1]
-        c = patch.quadric[2]
-        # f(q + s d) = qa s^2 + 2 qb s + qc, half the derivative is qb + qa s = -+ root.
-        qa = d[0] * d[0] + d[1] * d[1] + a * d[2] * d[2]
-        qb = q[0] * d[0] + q[1] * d[1] + (a * q[2] + 0.5 * b) * d[2]
-        qc = q[0] * q[0] + q[1] * q[1] + (a * q[2] + b) * q[2] - c
-        disc = qb * qb - qa * qc
-        if disc < 0.0:
-            return wp.vec4(0.0, 0.0, 0.0, 0.0)
-        root = wp.sqrt(disc)
-        if wp.abs(qb) > SURE_SLOPE * root:
-            root = wp.sign(qb) * root
-        else:
-            here = wp.vec3(q[0], q[1], a * q[2] + 0.5 * b)
-            # Sense of the crossing: of the facet, times whether the gradient agrees with the winding.
-            if wp.dot(facet, direction) * wp.dot(wp.transform_vector(m, facet), here) < 0.0:
-                root = -root
+        n = unit(wp.vec3(m[2, 0], m[2, 1], m[2, 2]))
+        return wp.vec4(n[0], n[1], n[2], -q[2] / d[2])
+    abc = scene.patches[patch].quadric
+    a = abc[0]
+    # f(q + s d) = qa s^2 + 2 qb s + qc; half the derivative is qb + qa s = -+ root.
+    z = a * q[2] + 0.5 * abc[1]
+    qa = d[0] * d[0] + d[1] * d[1] + a * d[2] * d[2]
+    qb = q[0] * d[0] + q[1] * d[1] + z * d[2]
+    qc = q[0] * q[0] + q[1] * q[1] + (z + 0.5 * abc[1]) * q[2] - abc[2]
+    disc = qb * qb - qa * qc
+    if disc < 0.0:
+        return wp.vec4(0.0, 0.0, 0.0, 0.0)
+    root = wp.sqrt(disc)
+    # Half derivative = +root has s = (root - qb) / qa = -qc / (qb + root), exact where the signs agree.
+    s = -qc / (qb + wp.sign(qb) * root)
+    if wp.abs(qb) <= SURE_SLOPE * root or qb == 0.0:
+        corner = scene.triangles[triangle]
+        v0 = scene.points[corner[0]]
+        v1 = scene.points[corner[1]]
+        v2 = scene.points[corner[2]]
+        facet = facet_normal(v0, v1, v2)
+        # Sense of the crossing: of the facet, times whether the gradient agrees with the winding.
+        agree = wp.dot(wp.transform_vector(m, facet), wp.vec3(q[0], q[1], z))
+        if wp.dot(facet, direction) * agree < 0.0:
+            root = -root
         if qb * root > 0.0:
-            # Half derivative = +root has s = (root - qb) / qa = -qc / (qb + root): no cancellation.
             s = -qc / (qb + root)
         elif qa != 0.0:
             s = (root - qb) / qa
-        elif qc != 0.0:
+        else:
             return wp.vec4(0.0, 0.0, 0.0, 0.0)
-        moved = q + s * d
-        gradient = wp.vec3(moved[0], moved[1], a * moved[2] + 0.5 * b)
-    if not (wp.abs(s) <= reach):
-        return wp.vec4(0.0, 0.0, 0.0, 0.0)
-    n = unit(wp.transform_vector(wp.transpose(m), gradient))
+        if not (wp.abs(s) <= wp.max(wp.max(max_abs(v1 - v0), max_abs(v2 - v1)), max_abs(v0 - v2))):
+            return wp.vec4(0.0, 0.0, 0.0, 0.0)
+    gx = q[0] + s * d[0]
+    gy = q[1] + s * d[1]
+    gz = z + s * a * d[2]
+    n = unit(
+        gx * wp.vec3(m[0, 0], m[0, 1], m[0, 2])
+        + gy * wp.vec3(m[1, 0], m[1, 1], m[1, 2])
+        + gz * wp.vec3(m[2, 0], m[2, 1], m[2, 2])
+    )
     return wp.vec4(n[0], n[1], n[2], s)
 
 
 @wp.func
-def surface_at(scene: SceneView, camera: CameraView, triangle: int, x: float, y: float) -> Surface:
+def surface_at(
+    scene: SceneView, camera: CameraView, triangle: int, depth_key: float, x: float, y: float
+) -> Surface:
     """The surface that the eye sees at pixel coordinate (x, y) on a triangle of the G-buffer.
 
-    Weights come from the eye frame, where a far scene loses nothing. The raster snaps to 1/256 pixel, so a
-    pixel's ray may pass just outside the facet. A polished point is still the ray's own (the facet only tells
-    where to look); otherwise the weights are clamped and the incident direction is the one to the point.
+    A polished point is the pixel ray's own; the facet, or in perspective the depth key alone, tells where to
+    look. On other facets the weights come from the eye frame, where a far scene loses nothing. The raster
+    snaps to 1/256 pixel, so a ray may pass just outside its facet: the weights are clamped and the incident
+    direction is the one to the point.
     """
+    result = Surface()
+    direction = eye_ray_direction(camera, x, y)
+    incident = unit(direction)
+    shape = scene.patches[scene.triangle_patch[triangle]].shape
+    if shape == SHAPE_QUADRIC and camera.orthographic == 0:
+        p = direction / depth_key
+        start = camera.eye + p
+        polished = polish(scene, triangle, start, incident)
+        n = wp.vec3(polished[0], polished[1], polished[2])
+        if n[0] != 0.0 or n[1] != 0.0 or n[2] != 0.0:
+            result.p_eye = p + polished[3] * incident
+            # From the very point that was polished: a distant eye's rounding must not enter again.
+            result.p_scene = start + polished[3] * incident
+            result.incident = incident
+            if wp.dot(n, incident) > 0.0:
+                n = -n
+            result.normal = n
+            return result
+
     tri = scene.triangles[triangle]
     v0 = scene.points[tri[0]]
     v1 = scene.points[tri[1]]
@@ -133,41 +151,24 @@ def surface_at(scene: SceneView, camera: CameraView, triangle: int, x: float, y:
     a = v0 - camera.eye
     b = v1 - camera.eye
     c = v2 - camera.eye
-    direction = eye_ray_direction(camera, x, y)
     hit = intersect_triangle(eye_ray_origin(camera, x, y), direction, a, b, c)
-    result = Surface()
-    result.facet = facet_normal(a, b, c)
     weights = clamp_weights(hit.u, hit.v)
     if hit.det == 0.0:
         weights = wp.vec2(1.0 / 3.0, 1.0 / 3.0)
-    result.u = weights[0]
-    result.v = weights[1]
-    patch = scene.triangle_patch[triangle]
-    if scene.patches[patch].shape != SHAPE_NONE:
-        if hit.det != 0.0 and wp.min(wp.min(hit.u, hit.v), hit.w) > LEAST_WEIGHT:
-            weights = wp.vec2(hit.u, hit.v)
-        incident = unit(direction)
-        w = 1.0 - weights[0] - weights[1]
-        p = w * v0 + weights[0] * v1 + weights[1] * v2
-        reach = wp.max(wp.max(max_abs(b - a), max_abs(c - b)), max_abs(a - c))
-        polished = polish(scene.patches[patch], p, incident, result.facet, reach)
-        n = wp.vec3(polished[0], polished[1], polished[2])
-        if n[0] != 0.0 or n[1] != 0.0 or n[2] != 0.0:
-            step = polished[3] * incident
-            result.p_scene = p + step
-            result.p_eye = w * a + weights[0] * b + weights[1] * c + step
-            if wp.dot(n, incident) > 0.0:
-                n = -n
-            result.incident = incident
-            result.normal = n
-            return result
-    w = 1.0 - result.u - result.v
-    result.p_scene = w * v0 + result.u * v1 + result.v * v2
-    result.p_eye = w * a + result.u * b + result.v * c
-    incident = unit(result.p_eye)
-    if camera.orthographic != 0:
-        incident = unit(direction)
-    n = shading_normal(scene, triangle, result.u, result.v, result.facet)
+    u = weights[0]
+    v = weights[1]
+    w = 1.0 - u - v
+    result.p_scene = w * v0 + u * v1 + v * v2
+    result.p_eye = w * a + u * b + v * c
+    if camera.orthographic == 0:
+        incident = unit(result.p_eye)
+    n = shading_normal(scene, triangle, u, v, facet_normal(a, b, c))
+    if shape == SHAPE_PLANE or (shape == SHAPE_QUADRIC and camera.orthographic != 0):
+        polished = polish(scene, triangle, result.p_scene, incident)
+        if polished[0] != 0.0 or polished[1] != 0.0 or polished[2] != 0.0:
+            n = wp.vec3(polished[0], polished[1], polished[2])
+            result.p_scene += polished[3] * incident
+            result.p_eye += polished[3] * incident
     if wp.dot(n, incident) > 0.0:
         n = -n
     if n[0] == 0.0 and n[1] == 0.0 and n[2] == 0.0:
@@ -200,6 +201,7 @@ def mirror_pixels_kernel(
     scene: SceneView,
     camera: CameraView,
     triangle: wp.array(dtype=int),
+    depth_key: wp.array(dtype=float),
     pixel: wp.array(dtype=int),
     out_point: wp.array(dtype=wp.vec3),
     out_normal: wp.array(dtype=wp.vec3),
@@ -210,11 +212,12 @@ def mirror_pixels_kernel(
     p = pixel[i]
     row = p // camera.width
     x = float(p - row * camera.width) + 0.5
-    s = surface_at(scene, camera, triangle[p], x, float(row) + 0.5)
+    s = surface_at(scene, camera, triangle[p], depth_key[p], x, float(row) + 0.5)
     out_point[i] = s.p_scene
     out_normal[i] = s.normal
-    # The unit length is lost to rounding only; restored because the trace's distances count in it.
-    out_direction[i] = unit(s.incident - 2.0 * wp.dot(s.incident, s.normal) * s.normal)
+    d = s.incident - 2.0 * wp.dot(s.incident, s.normal) * s.normal
+    # Distances count in its length, which is 1 up to rounding: one Newton step of 1 / sqrt restores it.
+    out_direction[i] = (1.5 - 0.5 * wp.dot(d, d)) * d
 
 
 def mirror_pixels(
@@ -270,6 +273,7 @@ def mirror_pixels(
                 scene.view,
                 gbuffer.view,
                 gbuffer.triangle,
+                gbuffer.depth_key,
                 mirror.pixel,
                 mirror.point,
                 mirror.normal,
@@ -284,7 +288,8 @@ def mirror_pixels(
 
 def _pixels_by_reflector(reflector_id: np.ndarray, parts: Mapping[int, int]) -> dict[int, np.ndarray]:
     """Ascending int32 pixel numbers of every id."""
-    pixel = np.flatnonzero(reflector_id).astype(np.int32)
+    # The comparison makes it twice as fast as on the numbers themselves.
+    pixel = np.flatnonzero(reflector_id != 0).astype(np.int32)
     if len(parts) == 1:
         return dict.fromkeys(parts, pixel)
     ids = reflector_id[pixel]
@@ -310,6 +315,7 @@ def surface_channels_kernel(
     scene: SceneView,
     camera: CameraView,
     triangle: wp.array(dtype=int),
+    depth_key: wp.array(dtype=float),
     out_depth: wp.array(dtype=float),
     out_normal: wp.array(dtype=wp.vec3),
     out_prim: wp.array(dtype=int),
@@ -323,7 +329,7 @@ def surface_channels_kernel(
         out_prim[i] = 0
         return
     row = i // camera.width
-    s = surface_at(scene, camera, tri, float(i - row * camera.width) + 0.5, float(row) + 0.5)
+    s = surface_at(scene, camera, tri, depth_key[i], float(i - row * camera.width) + 0.5, float(row) + 0.5)
     out_depth[i] = wp.dot(camera.forward, s.p_eye)
     out_normal[i] = s.normal
     out_prim[i] = scene.patches[scene.triangle_patch[tri]].prim
@@ -343,7 +349,7 @@ def surface_channels(scene: Scene, gbuffer: GBuffer, threads: int = 0) -> dict[s
     launch.launch(
         surface_channels_kernel,
         count,
-        [scene.view, gbuffer.view, gbuffer.triangle, depth, normal, prim],
+        [scene.view, gbuffer.view, gbuffer.triangle, gbuffer.depth_key, depth, normal, prim],
         scene.device,
         threads,
     )
