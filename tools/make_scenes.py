@@ -1,11 +1,12 @@
-"""Write the stages of `usd_scenes/`: small, original, deterministic, one reflection effect or one paper scene each.
+"""Write the stages of `usd_scenes/`: small, original, one reflection effect or one paper scene each.
 
 `python tools/make_scenes.py [--out DIR] [--only NAME] [--scale K] [--large DIR]`; from a benchmark:
 `make_scenes.build("kitchen", "/tmp/kitchen.usdc", scale=4)`.
 
-Lengths are metres, +Y is up, colours linear Rec.709. `scale` multiplies the segments along each direction of every
-mesh, so triangles grow with its square. Shared objects are files of their own in `parts/` beside the scene.
-What a scene expects of a renderer stands in its layer's `customLayerData["warp_reflect"]`.
+Lengths are metres, +Y is up, colours linear Rec.709; two runs write the same bytes. `scale` multiplies the
+segments along each direction of every mesh, so triangles grow with its square. Shared objects are files of
+their own in `parts/` beside the scene. What a scene expects of a renderer stands in its layer's
+`customLayerData["warp_reflect"]`.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdValidation, Vt
 from scene_parts import LOOKS, PARTS, STAND_BEAD, STAND_RING, Copies, Look, checked_sheet
 from scene_shapes import Detail, Surface, block, merge, patch, revolve, rotation, sheet, weld
 
-# Decimals of a coordinate [m] and of a normal in the committed text. What a mirror shows is dull: 0.1 mm and half a
-# degree are below its pixels. A mirror's own normals turn rays. Finer builds (scale above 1) are not rounded.
+# Decimals of a coordinate [m] and of a normal in the committed text. On dull things 0.1 mm and half a degree
+# are not seen; a mirror's own normals turn rays. Finer builds (scale above 1) are not rounded.
 DIGITS = (4, 2)
 MIRROR_DIGITS = (6, 4)
 MIRROR_PARTS = ("kettle",)
@@ -78,7 +79,7 @@ class Writer:
         UsdShade.MaterialBindingAPI.Apply(prim).Bind(material)
 
     def sphere(self, path: str, translate, radii, look: str, rotate=(0, 0, 0)) -> UsdGeom.Sphere:
-        """A Sphere gprim; one number is a radius, three are an ellipsoid's half axes (a scale op on radius 1)."""
+        """A Sphere gprim: one number is its radius, three are half axes (a scale op on radius 1)."""
         prim = UsdGeom.Sphere.Define(self.stage, path)
         scale = None
         if np.ndim(radii) == 0:
@@ -92,7 +93,7 @@ class Writer:
         """A Cube gprim standing on the middle of its bottom."""
         prim = UsdGeom.Cube.Define(self.stage, path)
         prim.CreateSizeAttr(1.0)
-        middle = np.asarray(bottom, float) + (0, 0.5 * size[1], 0)
+        middle = np.add(bottom, (0, 0.5 * size[1], 0))
         return self._gprim(prim, middle, rotate, size, look)
 
     def cylinder(self, path: str, bottom, radius: float, height: float, look: str) -> UsdGeom.Cylinder:
@@ -100,7 +101,7 @@ class Writer:
         prim.CreateAxisAttr(UsdGeom.Tokens.y)
         prim.CreateRadiusAttr(radius)
         prim.CreateHeightAttr(height)
-        middle = np.asarray(bottom, float) + (0, 0.5 * height, 0)
+        middle = np.add(bottom, (0, 0.5 * height, 0))
         return self._gprim(prim, middle, (0, 0, 0), None, look)
 
     def capsule(
@@ -114,11 +115,11 @@ class Writer:
 
     def _gprim(self, prim, translate, rotate, scale, look):
         prim.CreateExtentAttr(UsdGeom.Boundable.ComputeExtentFromPlugins(prim, Usd.TimeCode.Default()))
-        self._transform(prim, translate, rotate, scale)
+        self.transform(prim, translate, rotate, scale)
         self.bind(prim.GetPrim(), look)
         return prim
 
-    def _transform(self, prim, translate, rotate=(0, 0, 0), scale=None) -> None:
+    def transform(self, prim, translate, rotate=(0, 0, 0), scale=None) -> None:
         xformable = UsdGeom.Xformable(prim)
         xformable.AddTranslateOp().Set(Gf.Vec3d(*np.round(np.asarray(translate, float), 6).tolist()))
         if any(rotate):
@@ -136,18 +137,18 @@ class Writer:
         look=None,
         instance=True,
     ) -> Usd.Prim:
-        """A reference to a part file, written where it is missing; a native instance by default.
+        """A reference to a part file, written at its first use; a native instance by default.
 
-        Args:
-            look: bound to the referencing prim; the part's meshes without a look of their own inherit it.
+        `look` is bound to the referencing prim: the part's meshes without a look of their own inherit it.
         """
         if name not in self.written:
             self.written.add(name)
             write_part(name, self)
         prim = UsdGeom.Xform.Define(self.stage, path).GetPrim()
         prim.GetReferences().AddReference(f"{self.parts_asset}/{name}{self.suffix}")
-        self._transform(prim, translate, rotate, None if scale == 1.0 else scale)
-        prim.SetInstanceable(instance)
+        self.transform(prim, translate, rotate, None if scale == 1.0 else scale)
+        if instance:
+            prim.SetInstanceable(True)
         if look:
             self.bind(prim, look)
         return prim
@@ -165,7 +166,7 @@ class Writer:
         view = np.asarray(target, float) - np.asarray(eye, float)
         pitch = math.degrees(math.atan2(view[1], math.hypot(view[0], view[2])))
         yaw = math.degrees(math.atan2(-view[0], -view[2]))
-        self._transform(prim, eye, (round(pitch, 3), round(yaw, 3), 0.0))
+        self.transform(prim, eye, (round(pitch, 3), round(yaw, 3), 0.0))
 
     def lights(self, dome=(0.62, 0.7, 0.82), sun: float = 2.2, sun_rotate=(-62, 24, 0)) -> None:
         """A constant dome and a distant light of irradiance `sun` (normalized: whatever its angle)."""
@@ -196,7 +197,7 @@ def _define_material(stage: Usd.Stage, path: Sdf.Path, look: Look) -> UsdShade.M
 
 
 def _new_stage(path: Path, root: str) -> Usd.Stage:
-    """An empty stage on a new file, whatever stood there before; metres, +Y up, an Xform `root` as default prim."""
+    """An empty stage on a file, whatever stood there; metres, +Y up, an Xform `root` as default prim."""
     path.parent.mkdir(parents=True, exist_ok=True)
     layer = Sdf.Layer.Find(str(path)) or Sdf.Layer.CreateNew(str(path))
     layer.Clear()
@@ -239,6 +240,7 @@ def build(name: str, path, scale: float = 1.0) -> Path:
 
     Args:
         name: A key of `SCENES`.
+        path: The file to write; the parts go to `parts/` (`parts_x<scale>/`) beside it, in the same format.
         scale: Multiplies the segments along each direction of every mesh; triangles grow with its square.
 
     Raises:
@@ -273,7 +275,7 @@ WALLS = (("Left", 90), ("Front", 180), ("Right", -90))  # about +Y [degrees], fr
 
 
 def _kitchen(w: Writer) -> None:
-    """A kitchen after figure 6 of Estalella et al. 2005: three chrome bodies among the things of a laid table."""
+    """Three chrome bodies among the things of a laid table, after figure 6 of Estalella et al. 2005."""
     _kitchen_shell(w)
     _kitchen_window(w)
     _kitchen_furniture(w)
@@ -446,8 +448,8 @@ def _kitchen_table(w: Writer) -> None:
 
 
 def _resting_height(half_height: float, radius: float) -> float:
-    """Height of the centre of an ellipsoid of revolution (about Y) on a ring stand, half a millimetre clear of it."""
-    # Where the meridian, offset by the bead's radius, passes the ring's circle: bisection on the meridian's parameter.
+    """Height of the centre of an ellipsoid of revolution (about Y) on a ring stand, just clear of it [m]."""
+    # Where the meridian, offset by the bead's radius, passes the ring's circle: bisection on its parameter.
     low, high = 0.0, math.pi / 2
     for _ in range(60):
         t = 0.5 * (low + high)
@@ -575,103 +577,134 @@ def _one_mirror(w: Writer) -> None:
 CHECKER = ((0.75, 0.73, 0.7), (0.06, 0.09, 0.12))
 
 
-def _checker(w: Writer, half: float, cells: int) -> None:
+def _arena(w: Writer, half: float, cells: int) -> None:
+    """A checker floor and, around scene and eye, a ring of pillars: else mirrors would show empty sky."""
     floor = checked_sheet(
         (-half, 0, half), (2 * half, 0, 0), (0, 0, -2 * half), cells, cells, CHECKER, w.detail
     )
     w.mesh("/World/Floor", floor)
+    looks = (
+        "Red",
+        "Cream",
+        "Orange",
+        "SkyBlue",
+        "Lemon",
+        "Green",
+        "Pink",
+        "Teal",
+        "Purple",
+        "Coral",
+        "Leaf",
+        "Blue",
+    )
+    for k, look in enumerate(looks):
+        a = math.radians(30 * k + 15)
+        height = half * (0.3 + 0.12 * (k * 5 % 4))
+        at = (0.95 * half * math.sin(a), 0, 0.95 * half * math.cos(a))
+        w.cube(f"/World/Pillar{k:02d}", at, (0.2 * half, height, 0.06 * half), look, (0, 30 * k + 15, 0))
+
+
+def _boxes(w: Writer, *boxes) -> None:
+    """Boxes given as (x, z, width, height, turn [degrees], look)."""
+    for k, (x, z, width, height, turn, look) in enumerate(boxes):
+        w.cube(f"/World/Box{k}", (x, 0, z), (width, height, width), look, (0, turn, 0))
 
 
 def _sphere_on_checker(w: Writer) -> None:
-    _checker(w, 4.0, 20)
+    _arena(w, 7.0, 28)
     w.sphere("/World/Mirror", (0, 1.005, 0), 1.0, "Chrome")
-    for k, (x, z, look) in enumerate(
-        ((-1.7, 0.6, "Red"), (1.6, 0.8, "Yellow"), (-0.9, 1.9, "Green"), (1.3, -1.6, "Blue"))
-    ):
-        w.cube(f"/World/Box{k}", (x, 0, z), (0.5, 0.4 + 0.3 * k, 0.5), look, (0, 20 + 25 * k, 0))
-    w.camera((0.6, 2.0, 5.2), (0, 0.85, 0), 36)
+    _boxes(
+        w,
+        (-1.7, 0.6, 0.5, 0.5, 20, "Red"),
+        (1.55, 0.9, 0.5, 0.7, 45, "Yellow"),
+        (-1.1, 1.9, 0.5, 0.6, 70, "Green"),
+        (1.3, -1.6, 0.5, 1.3, 95, "Blue"),
+        (0.35, 2.2, 0.3, 0.3, 15, "Orange"),
+        (-1.5, -1.5, 0.6, 1.7, 30, "Purple"),
+    )
+    w.camera((0.6, 2.0, 5.2), (0, 0.95, 0), 31)
     w.lights()
 
 
 def _ellipsoid_row(w: Writer) -> None:
-    _checker(w, 5.0, 20)
+    _arena(w, 7.0, 28)
     w.sphere("/World/Tall", (-1.75, 1.38, 0), (0.45, 1.35, 0.45), "Chrome")
     w.sphere("/World/Disc", (0, 0.9, 0), (0.8, 0.8, 0.16), "Chrome", (0, 12, 0))
-    w.sphere("/World/Cigar", (2.15, 0.4, 0.35), (1.25, 0.25, 0.25), "Chrome", (0, 25, 0))
+    w.sphere("/World/Cigar", (2.1, 0.5, 0.3), (1.6, 0.32, 0.32), "Chrome", (0, 25, 0))
     looks = ("Red", "Orange", "Lemon", "Green", "SkyBlue", "Purple", "Pink")
-    for k, look in enumerate(looks):
-        a = math.radians(-80 + 160 / 6 * k)
-        w.cube(
-            f"/World/Near{k}",
-            (round(3.2 * math.sin(a), 3), 0, round(1.6 * math.cos(a) + 0.3, 3)),
-            (0.35, 0.35, 0.35),
-            look,
-            (0, 17 * k, 0),
-        )
-        w.cube(
-            f"/World/Far{k}",
-            (-3.0 + k, 0, -2.2),
-            (0.5, 0.6 + 0.2 * (k * 3 % 5), 0.4),
-            looks[-1 - k],
-            (0, 11 * k, 0),
-        )
-    w.camera((0.2, 1.7, 6.4), (0.2, 0.95, 0), 36)
+    near = [
+        (3.0 * math.sin(a), 1.5 * math.cos(a) + 0.3, 0.3, 0.3, 17 * k, looks[k])
+        for k, a in enumerate(np.radians(np.linspace(-80, 80, 7)))
+    ]
+    far = [(-3.0 + k, -2.2, 0.45, 0.6 + 0.2 * (k * 3 % 5), 11 * k, looks[-1 - k]) for k in range(7)]
+    _boxes(w, *near, *far)
+    w.camera((0.2, 1.9, 6.0), (0.4, 1.15, 0), 36)
     w.lights()
 
 
 def _capped_cylinder(w: Writer) -> None:
-    _checker(w, 4.0, 20)
+    _arena(w, 7.0, 28)
     w.cylinder("/World/Cylinder", (-0.95, 0.01, 0), 0.65, 1.2, "Chrome")
     w.capsule("/World/Capsule", (1.05, 1.0, 0.1), 0.5, 0.9, "Chrome", (0, 0, 12))
-    for k, (x, z, look) in enumerate(
-        ((-2.2, 0.9, "Red"), (0.1, 1.3, "Yellow"), (2.2, 0.9, "Green"), (-0.1, -1.5, "Blue"))
-    ):
-        w.cube(f"/World/Box{k}", (x, 0, z), (0.4, 0.5, 0.4), look, (0, 15 + 25 * k, 0))
-    w.cube("/World/Board", (0, 2.6, -1.5), (3.6, 0.9, 0.1), "Coral")
-    w.camera((0.2, 2.7, 5.2), (0.05, 0.9, 0), 36)
+    _boxes(
+        w,
+        (-2.2, 0.9, 0.4, 0.5, 15, "Red"),
+        (0.1, 1.3, 0.4, 0.4, 40, "Yellow"),
+        (2.2, 0.9, 0.4, 0.6, 65, "Green"),
+        (-0.1, -1.5, 0.4, 0.9, 90, "Blue"),
+    )
+    w.cube("/World/Board", (0, 2.5, -1.5), (3.6, 0.9, 0.1), "Coral")
+    w.camera((0.2, 2.9, 4.9), (0.05, 0.95, 0), 33)
     w.lights()
 
 
 def _two_spheres(w: Writer) -> None:
-    _checker(w, 4.0, 20)
+    _arena(w, 7.0, 28)
     w.sphere("/World/Left", (-0.95, 0.905, 0), 0.9, "Chrome")
     w.sphere("/World/Right", (1.0, 0.705, 0.35), 0.7, "Chrome")
-    for k, (x, z, look) in enumerate(
-        ((-2.2, 0.9, "Red"), (0.1, 1.4, "Orange"), (2.1, 1.3, "Green"), (0.3, -1.4, "SkyBlue"))
-    ):
-        w.cube(f"/World/Box{k}", (x, 0, z), (0.4, 0.35 + 0.25 * k, 0.4), look, (0, 15 + 25 * k, 0))
-    w.camera((0.1, 1.9, 5.0), (0.0, 0.75, 0), 36)
+    _boxes(
+        w,
+        (-2.1, 0.9, 0.4, 0.4, 15, "Red"),
+        (0.1, 1.3, 0.35, 0.35, 40, "Orange"),
+        (1.9, 1.3, 0.4, 0.5, 65, "Green"),
+        (0.3, -1.4, 0.4, 1.2, 90, "SkyBlue"),
+    )
+    w.camera((0.1, 1.9, 5.0), (0.0, 0.75, 0), 31)
     w.lights()
 
 
 def _open_bowl(w: Writer) -> None:
-    """A thin double-sided shell: its rim is a border, so no closed map holds it, and inside it sees itself."""
+    """A thin double-sided shell: its rim is a border (no closed map holds it) and inside it sees itself."""
     d = w.detail
-    _checker(w, 3.0, 16)
+    _arena(w, 5.0, 16)
     t = np.linspace(-math.pi / 2, -0.1, d.count(10) + 1)
     r, y = np.cos(t), np.sin(t)
     r[0] = 0.0
-    shell = revolve(r, 0.8 * y, d.count(36), np.stack([0.8 * r, y], 1))
+    shell = revolve(r, 0.8 * y, d.count(32), np.stack([0.8 * r, y], 1))
     bowl = w.mesh("/World/Bowl", shell, "Chrome", double_sided=True, digits=MIRROR_DIGITS)
-    w._transform(bowl, (0, 0.86, 0), (24, 0, 10))
-    for k, (x, z, look) in enumerate(
-        ((-1.6, 0.7, "Red"), (1.5, 0.9, "Yellow"), (-0.9, -1.5, "Green"), (1.2, -1.5, "Blue"))
-    ):
-        w.cube(f"/World/Box{k}", (x, 0, z), (0.4, 0.5 + 0.4 * k, 0.4), look, (0, 20 + 25 * k, 0))
-    w.cube("/World/Board", (0, 2.9, -1.8), (3.0, 0.6, 0.1), "Coral")
-    w.camera((0.5, 2.3, 4.3), (0, 0.65, 0), 34)
+    w.transform(bowl, (0, 0.86, 0), (24, 0, 10))
+    _boxes(
+        w,
+        (-1.5, 0.7, 0.4, 0.5, 20, "Red"),
+        (1.4, 0.9, 0.4, 0.7, 45, "Yellow"),
+        (-0.9, -1.5, 0.4, 1.3, 70, "Green"),
+        (1.2, -1.5, 0.4, 1.7, 95, "Blue"),
+    )
+    w.cube("/World/Board", (0, 2.4, -1.8), (3.0, 0.6, 0.1), "Coral")
+    w.camera((0.4, 2.6, 3.9), (0, 0.65, 0), 30)
     w.lights()
 
 
 def _mesh_kettle(w: Writer) -> None:
-    _checker(w, 0.8, 16)
+    _arena(w, 1.4, 28)
     _chrome_kettle(w, (0, 0, 0), -30)
     looks = ("Red", "Orange", "Lemon", "Green", "SkyBlue", "Purple")
+    boxes = []
     for k, look in enumerate(looks):
         a = math.radians(60 * k + 30)
-        at = (round(0.42 * math.sin(a), 4), 0, round(0.42 * math.cos(a), 4))
-        w.cube(f"/World/Box{k}", at, (0.09, 0.07 + 0.025 * k, 0.09), look, (0, 23 * k, 0))
-    w.camera((0.12, 0.42, 0.95), (0, 0.135, 0), 27)
+        boxes.append((0.34 * math.sin(a), 0.3 * math.cos(a), 0.07, 0.06 + 0.03 * (k * 5 % 6), 23 * k, look))
+    _boxes(w, *boxes)
+    w.camera((0.1, 0.4, 0.92), (0, 0.165, 0), 25)
     w.lights()
 
 
@@ -681,13 +714,13 @@ def _far_offset(w: Writer) -> None:
     build("sphere_on_checker", near, w.detail.scale)
     world = w.stage.GetDefaultPrim()
     world.GetReferences().AddReference(f"./{near.name}")
-    UsdGeom.Xformable(world).AddTranslateOp().Set(Gf.Vec3d(1e7, 0.0, -2e7))
+    w.transform(world, (1e7, 0.0, -2e7))
 
 
 SCENES = {
     "kitchen": Recipe(
         _kitchen,
-        "Three convex chrome bodies (mesh, sphere, ellipsoid) on a laid kitchen table; after Estalella et al. 2005, fig. 6",
+        "Chrome mesh, sphere and ellipsoid on a laid kitchen table; after Estalella et al. 2005, figure 6",
         ("/World/Kettle/Body", "/World/ChromeSphere", "/World/ChromeEllipsoid"),
     ),
     "one_mirror": Recipe(
@@ -718,11 +751,6 @@ SCENES = {
         ("/World/Mirror",),
     ),
 }
-
-
-# --------------------------------------------------------------------------------------------------------------
-# Checks and the command
-# --------------------------------------------------------------------------------------------------------------
 
 
 def triangle_count(path) -> tuple[int, int]:
@@ -765,22 +793,27 @@ def main() -> int:
     if args.large:
         jobs += [(name, args.large / f"{name}.usdc", LARGE_SCALE) for name in ("kitchen", "one_mirror")]
     failed = False
+    folders = set()
     for name, path, scale in jobs:
         build(name, path, scale)
-        parts = sorted(path.parent.glob(f"parts*/*{path.suffix}"))
-        errors = validate(path)
+        folders |= {(folder, path.suffix) for folder in path.parent.glob("parts*")}
         triangles, curved = triangle_count(path)
         print(f"{path}: {triangles:,} triangles, {curved} curved gprims, {path.stat().st_size / 1000:.1f} kB")
-        for error in errors:
-            print(f"  {error}")
-        failed = failed or bool(errors)
-    for part in parts:
-        errors = validate(part)
-        failed = failed or bool(errors)
-        for error in errors:
-            print(f"{part}: {error}")
-    print(f"parts: {len(parts)} files, {sum(p.stat().st_size for p in parts) / 1000:.0f} kB")
+        failed = _report(path) or failed
+    for folder, suffix in sorted(folders):
+        parts = sorted(folder.glob(f"*{suffix}"))
+        size = sum(part.stat().st_size for part in parts)
+        print(f"{folder}: {len(parts)} parts, {size / 1000:.0f} kB")
+        for part in parts:
+            failed = _report(part) or failed
     return 1 if failed else 0
+
+
+def _report(path: Path) -> bool:
+    errors = validate(path)
+    for error in errors:
+        print(f"  {path}: {error}")
+    return bool(errors)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
-"""The looks and the shared objects (`usd_scenes/parts/`) of the scenes: fruit, crockery, furniture, tiles, toys.
+"""The looks and the shared objects (`usd_scenes/parts/`) of the scenes.
 
-A part stands on y = 0 about its own origin unless its docstring says otherwise; metres, +Y up, its front is +Z.
+A part stands on y = 0 about its own origin unless its docstring says otherwise; metres, +Y up, front +Z.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ class Copies:
     places: tuple[tuple[float, float, float], ...]
 
 
-# Name, what, look. Without a look: the faces' own displayColor, else the look bound to whatever references the part.
+# Name, what, look. Without a look: the faces' own displayColor, else what is bound to the referencing prim.
 Pieces = list[tuple[str, Surface | Copies, str | None]]
 
 
@@ -415,7 +415,7 @@ FOOT_BEAD = 0.008
 
 
 def _kettle_foot() -> tuple[float, float, float]:
-    """(ring radius, height of the ring's centre under the body's bottom, height of that bottom above the table)."""
+    """(ring radius, height of the ring's centre over the body's bottom, of that bottom over the table)."""
     (point,), (normal,) = KETTLE.meridian([math.radians(-75)])
     center = point + (FOOT_BEAD + KETTLE_GAP) * normal
     return float(center[0]), float(center[1]), FOOT_BEAD - float(center[1])
@@ -432,9 +432,9 @@ def _kettle_trim(d: Detail) -> Pieces:
     base, out = np.array([-spout_at[0], spout_at[1], 0]), np.array([-spout_out[0], spout_out[1], 0])
     n = d.count(6)
     u = np.linspace(0, 1, n + 1)[:, None]
-    tip = base + (-0.09, 0.085, 0)
+    tip = base + np.array([-0.09, 0.085, 0.0])
     spout = (1 - u) ** 2 * (base + KETTLE_GAP * out) + 2 * u * (1 - u) * (base + 0.055 * out) + u**2 * tip
-    foot = shoulder + 0.014 * shoulder_out
+    foot = shoulder + 0.01 * shoulder_out
     n = d.count(12)
     grip = arc((0, foot[1], 0), (foot[0], 0.12), 0, 180, n)
     knob = [(0, 0.0), (0.014, 0.0), (0.01, 0.01), (0.02, 0.022), (0.017, 0.032), (0, 0.036)]

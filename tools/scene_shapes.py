@@ -23,7 +23,7 @@ class Detail:
 
 @dataclass(frozen=True)
 class Surface:
-    """A polygon mesh: points [n, 3], vertices per face [f], their indices, unit normals [n, 3] or None (flat).
+    """A polygon mesh: points [n, 3], vertices per face [f], indices, unit normals [n, 3] or None (flat).
 
     `color_index` [f] into `palette` gives every face a displayColor; None: one material for all.
     """
@@ -128,12 +128,10 @@ def patch(rows: np.ndarray, wrap_rows: bool = False, wrap_columns: bool = False)
 
 
 def revolve(radius, height, segments: int, normals=None) -> Surface:
-    """A profile (radius, height) turned about +Y, from its lower outside to its end; radius 0 at an end is a pole.
+    """A profile (radius, height) turned about +Y, from its lower outside on; radius 0 at an end is a pole.
 
-    Faces run around, span by span: face k lies in span k // segments and sector k % segments.
-
-    Args:
-        normals: (radial, vertical) parts of the profile's unit normals [n, 2]; None: from the facets.
+    Faces run around, span by span: face k lies in span k // segments and sector k % segments. `normals`: the
+    (radial, vertical) parts of the profile's unit normals [n, 2]; None: from the facets.
     """
     radius, height = np.asarray(radius, float), np.asarray(height, float)
     angle = np.arange(segments) * (2.0 * math.pi / segments)
@@ -154,7 +152,7 @@ def revolve(radius, height, segments: int, normals=None) -> Surface:
 
 
 def lathe(profile, detail: Detail, segments: int) -> Surface:
-    """A smooth solid of revolution through profile points (r, y); finer details follow a Catmull-Rom spline."""
+    """A smooth solid of revolution through profile points (r, y), refined along a Catmull-Rom spline."""
     p = np.asarray(profile, float)
     q = np.concatenate([2 * p[:1] - p[1:2], p, 2 * p[-1:] - p[-2:-1]])
     t = (np.arange(detail.count(1)) / detail.count(1))[:, None]
@@ -168,8 +166,7 @@ def lathe(profile, detail: Detail, segments: int) -> Surface:
 def turned(profile, detail: Detail, segments: int, palette=(), spans=()) -> Surface:
     """A solid of revolution with straight spans between profile points (r, y).
 
-    Args:
-        spans: number of the palette colour of each span; empty: unpainted.
+    `spans`: number of each span's colour in the palette; empty: unpainted.
     """
     p = np.asarray(profile, float)
     pieces = detail.count(1)
@@ -227,7 +224,7 @@ def sheet(origin, across, along, columns: int, rows: int) -> Surface:
 
 
 def block(size, detail: Detail, bevel: float = 0.0, cell: float = 0.0) -> Surface:
-    """A box about its bottom's middle, edges cut off by `bevel`, faces cut into cells of about `cell` (0: one)."""
+    """A box about its bottom's middle: edges cut off by `bevel`, faces in cells of about `cell` (0: one)."""
     half = 0.5 * np.asarray(size, float)
     inner = half - bevel
     parts = []
@@ -272,10 +269,9 @@ def _bevels(half: np.ndarray, inner: np.ndarray) -> Surface:
 
 
 def tiles(columns: int, rows: int, pitch: float, palette, detail: Detail, pattern=None) -> Surface:
-    """Bevelled tiles on grout in the x-y plane from the origin, facing +z; the last palette entry is the grout.
+    """Bevelled tiles in the x-y plane from the origin, facing +z, on grout of the palette's last colour.
 
-    Args:
-        pattern: colour number of tile (column, row); None: a checker of the first two.
+    `pattern`: colour number of tile (column, row); None: a checker of the first two.
     """
     joint, depth = 0.02 * pitch, 0.05 * pitch
     pattern = pattern or (lambda i, j: (i + j) % 2)
@@ -311,7 +307,8 @@ class Egg:
     """A strictly convex body of revolution given by its support function, so that its normals are exact.
 
     h(t) = sqrt(equator^2 cos^2 t + pole^2 sin^2 t) + pear sin 3t over latitude t; its meridian is
-    (h cos t - h' sin t, h sin t + h' cos t) with normal (cos t, sin t), convex where h + h'' > 0. It rests on y = 0.
+    (h cos t - h' sin t, h sin t + h' cos t) with normal (cos t, sin t), convex where h + h'' > 0. It
+    rests on y = 0.
     """
 
     equator: float
