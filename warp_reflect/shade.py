@@ -285,7 +285,9 @@ def split_lobes(
     )
     if reflector:
         sharp = float(1.0)
-    mirror = sharp * schlick(f0, f90, cosine)
+    mirror = wp.vec3(0.0, 0.0, 0.0)
+    if sharp > 0.0:
+        mirror = sharp * schlick(f0, f90, cosine)
     blurred = (1.0 - sharp) * f0
     # F90 is 1 for a dielectric and the colour itself for a metal: the difference reaches the diffuse layer.
     albedo = blurred + wp.cw_mul(f90 - mirror - blurred, color)
@@ -295,7 +297,7 @@ def split_lobes(
         albedo = (1.0 - coat) * albedo
         mirror = (1.0 - coat) * mirror + wp.vec3(coat, coat, coat)
     lobes = Lobes()
-    lobes.base = scene.materials[material].emissive + wp.cw_mul(albedo, irradiance(lights, n) / PI)
+    lobes.base = scene.materials[material].emissive + wp.cw_mul(albedo, (1.0 / PI) * irradiance(lights, n))
     lobes.mirror = mirror
     return lobes
 
@@ -318,6 +320,14 @@ def hit_normal(scene: SceneView, triangle: int, u: float, v: float) -> wp.vec3:
     abc = scene.patches[patch].quadric
     gradient = wp.vec3(q[0], q[1], abc[0] * q[2] + 0.5 * abc[1])
     return unit(wp.transform_vector(wp.transpose(m), gradient))
+
+
+@wp.func
+def weights_matter(scene: SceneView, triangle: int) -> bool:
+    """Whether shading looks different from point to point of a triangle."""
+    if scene.normal_index[triangle][0] >= 0 or scene.color_index.shape[0] > 0:
+        return True
+    return scene.patches[scene.triangle_patch[triangle]].shape == SHAPE_QUADRIC
 
 
 @wp.func
@@ -368,15 +378,17 @@ def shade_kernel(
     reflector = reflector_id[i] > 0
     coverage = float(0.0)
     if tri >= 0:
-        corner = scene.triangles[tri]
-        hit = intersect_triangle(
-            eye_ray_origin(camera, x, y),
-            ray,
-            scene.points[corner[0]] - camera.eye,
-            scene.points[corner[1]] - camera.eye,
-            scene.points[corner[2]] - camera.eye,
-        )
-        uv = clamp_weights(hit.u, hit.v)
+        uv = wp.vec2(0.0, 0.0)
+        if weights_matter(scene, tri):
+            corner = scene.triangles[tri]
+            hit = intersect_triangle(
+                eye_ray_origin(camera, x, y),
+                ray,
+                scene.points[corner[0]] - camera.eye,
+                scene.points[corner[1]] - camera.eye,
+                scene.points[corner[2]] - camera.eye,
+            )
+            uv = clamp_weights(hit.u, hit.v)
         n = hit_normal(scene, tri, uv[0], uv[1])
         cosine = wp.dot(n, incident)
         onward = incident - 2.0 * cosine * n
