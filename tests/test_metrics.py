@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 
+from warp_reflect import metrics
 from warp_reflect.metrics import PixelClass, compare_frames
 from warp_reflect.settings import Status
 
@@ -72,12 +73,15 @@ def test_pixel_error_of_plane_mirror_is_the_shift(shift):
     assert result.shifted + result.unmatched == result.interior_pixels
 
 
-def test_pixel_error_finds_points_far_away():
-    """A block of pixels shows what belongs 30 pixels further right: too far for the slopes at the start."""
+@pytest.mark.parametrize("lookup_pixels", [4096, 100])
+def test_pixel_error_finds_points_far_away(monkeypatch, lookup_pixels):
+    """A block of pixels shows what belongs 30 pixels further right, beyond another prim."""
+    monkeypatch.setattr(metrics, "LOOKUP_PIXELS", lookup_pixels)
     reference = frame()
+    reference["reflectedId"][MIRROR[0], 38:42] = 8  # no slope leads across it
     points = reference["reflectedPoint"].copy()
     points[20:30, 20:30] = reference["reflectedPoint"][20:30, 50:60]
-    result = compare_frames(frame(reflectedPoint=points), reference)
+    result = compare_frames({**reference, "reflectedPoint": points}, reference)
     assert result.shifted == 100
     assert result.error_max_px == pytest.approx(30.0, abs=0.01)
     assert result.error_median_px == pytest.approx(30.0, abs=0.01)

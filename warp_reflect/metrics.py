@@ -25,7 +25,10 @@ CONVERGED_PX = 1e-3  # step length at which the search ends: 1/500 of the error 
 MATCH_FOOTPRINTS = 1.5
 # A difference inside a cell that is this many times the slope at the nearest pixel is a silhouette, no slope.
 LEAP = 4.0
-LOOKUP_CHUNK = 1 << 24  # distances held at once in the search over all pixels
+# Pixels of one (mirror, prim) a lost point is compared with; a larger area is sampled evenly, some pixels apart,
+# which is well within what the search walks from there.
+LOOKUP_PIXELS = 4096
+LOOKUP_CHUNK = 1 << 22  # distances held at once, 32 MB
 
 
 class PixelClass(IntEnum):
@@ -347,13 +350,19 @@ class _ReferenceField:
         return np.where(ahead, slopes[0], slopes[1]), goods[0] | goods[1]
 
     def _nearest_pixels(self, keys: np.ndarray, targets: np.ndarray):
-        """The pixel of each key with the nearest point: (whether there is one [n], place [n, 2])."""
+        """The pixel of each key whose point is nearest: (whether there is one [n], place [n, 2])."""
         exists = np.zeros(len(keys), bool)
         place = np.zeros((len(keys), 2))
         for key in np.unique(keys):
             rows, columns = np.nonzero(self.key == key)
             if not rows.size:
                 continue
+            stride = math.ceil(math.sqrt(rows.size / LOOKUP_PIXELS))
+            if stride > 1:
+                kept = (rows % stride == 0) & (columns % stride == 0)
+                # An area thinner than the stride may hold no such pixel.
+                kept = kept if np.count_nonzero(kept) > LOOKUP_PIXELS // 4 else slice(None, None, stride**2)
+                rows, columns = rows[kept], columns[kept]
             members = np.nonzero(keys == key)[0]
             points = self.points[rows, columns]
             middle = points.mean(axis=0)
