@@ -25,8 +25,8 @@ CONVERGED_PX = 1e-3  # step length at which the search ends: 1/500 of the error 
 MATCH_FOOTPRINTS = 1.5
 # A difference inside a cell that is this many times the slope at the nearest pixel is a silhouette, no slope.
 LEAP = 4.0
-# Pixels of one (mirror, prim) a lost point is compared with; a larger area is sampled evenly, some pixels apart,
-# which is well within what the search walks from there.
+# Pixels of one (mirror, prim) that a lost point is compared with; a larger area is sampled evenly, some
+# pixels apart, which is well within what the search walks from there.
 LOOKUP_PIXELS = 4096
 LOOKUP_CHUNK = 1 << 22  # distances held at once, 32 MB
 
