@@ -25,12 +25,21 @@ from warp_reflect.quadrics import quadric_curve, quadric_half_gradient, quadric_
 wp.set_module_options({"enable_backward": False})
 
 MAX_ROOTS = 10  # the degree of the elimination for three different principal values
-SCAN_NODES = wp.constant(64)  # per interval between poles; 10 roots at most are spread over the intervals
-GRADING = wp.float64(5.0)  # nodes approach an interval's ends like x^5: down to 1e-9 of it
-BISECTIONS = wp.constant(50)
+SCAN_NODES = 96  # per interval between poles; 10 roots at most are spread over the intervals
+LAST_NODE = wp.float64(SCAN_NODES - 0.25)  # the end itself is a pole or infinity
+SCAN_STEP = wp.float64(1.0 / SCAN_NODES)
+CELL_NODES = 8  # per cell of the scan that is looked at closely
+CELL_STEP = wp.float64(1.0 / CELL_NODES)
+ROOT_STEPS = wp.constant(60)
+ROOT_WIDTH = wp.float64(1.0e-14)  # of the scan's parameter
+DIP_STEPS = wp.constant(40)  # golden section from a cell to 1e-8 of it, where a minimum is flat in float64
+DIP_DOUBT = wp.constant(12)  # steps after which a dip that is still high is taken for harmless
+TOUCH_SHARE = wp.float64(0.1)  # of the values beside a dip; one that touches zero falls far below
+GOLDEN = wp.float64(0.6180339887498949)
+T_SLACK = wp.float64(1.0e-3)  # starts this far outside the segment may still end on a root within
 POLISH_STEPS = wp.constant(40)
 SAME_ROOT = wp.float64(1.0e-7)  # of the size: closer points are one root found twice
-SPLIT = wp.float64(1.0e-7)  # of the size: how far a symmetric configuration is moved before the scan
+SPLIT = wp.float64(1.0e-6)  # of the size: how far a symmetric configuration is moved before the scan
 NULL_DIRECTION = wp.float64(
     1.0e-8
 )  # eigenvalues of the Hessian below this share are no direction to step along
@@ -65,7 +74,7 @@ def pencil_resultant(
     c: wp.float64,
     equal: int,
 ):
-    """F(mu), cleared of its poles, and E1 as (a1, b1, c1): a1 t^2 + b1 t + c1."""
+    """F(mu), cleared of its poles, and E2 as (a2, b2, c2): a2 t^2 + b2 t + c2."""
     one = wp.float64(1.0)
     two = wp.float64(2.0)
     w0 = one + mu * a[0]
@@ -85,15 +94,15 @@ def pencil_resultant(
     c2 = -to_v0
     u = a1 * c2 - a2 * c1
     f = u * u - (a1 * b2 - a2 * b1) * (b1 * c2 - b2 * c1)
-    clear = one
-    if a[0] != wp.float64(0.0):
+    # A single principal value leaves poles of order 4, a double or triple one of order 6; w = 1 where a = 0.
+    clear = w0 * w0
+    if equal == 1:
+        clear = clear * w1 * w1
+    else:
         clear = clear * w0
-    if equal < 2 and a[1] != wp.float64(0.0):
-        clear = clear * w1
-    if equal < 3 and a[2] != wp.float64(0.0):
-        clear = clear * w2
-    clear = clear * clear
-    return f * clear * clear, wp.vec3d(a1, b1, c1)
+    if equal < 3:
+        clear = clear * w2 * w2
+    return f * clear * clear, wp.vec3d(a2, b2, c2)
 
 
 @wp.func
@@ -101,8 +110,11 @@ def scan_node(x: wp.float64, low: wp.float64, high: wp.float64):
     """Mu at parameter x in (0, 1) of the interval [low, high], or [low, infinity) where high < low."""
     one = wp.float64(1.0)
     y = one - x
-    p = wp.pow(x, GRADING)
-    q = wp.pow(y, GRADING)
+    # Nodes approach the ends like x^4: down to 1e-8 of the interval.
+    p = x * x
+    p = p * p
+    q = y * y
+    q = q * q
     if high < low:
         return low + low * p / q
     if x < wp.float64(0.5):
@@ -262,59 +274,160 @@ def add_root(found: Roots, count: int, root: PolishedRoot, symmetric: int):
     return found, count + 1
 
 
-@wp.func
-def pencil_point(mu: wp.float64, t: wp.float64, v: wp.vec3d, d: wp.vec3d, a: wp.vec3d, b: wp.float64):
-    """R of the pencil at (mu, t)."""
-    one = wp.float64(1.0)
-    return wp.vec3d(
-        (v[0] + t * d[0]) / (one + mu * a[0]),
-        (v[1] + t * d[1]) / (one + mu * a[1]),
-        (v[2] + t * d[2] - mu * b) / (one + mu * a[2]),
-    )
+@wp.struct
+class Pencil:
+    """One pair of eye and target, and the stretch of the scan that is being looked at."""
+
+    o: wp.vec3d  # eye and target as the scan sees them, see `off_symmetry`
+    v: wp.vec3d
+    d: wp.vec3d  # o - v
+    eye: wp.vec3d  # their true positions
+    target: wp.vec3d
+    a: wp.vec3d
+    b: wp.float64
+    c: wp.float64
+    equal: int
+    sheet: int
+    symmetric: int
+    low: wp.float64  # the interval of mu between two poles; endless where high < low
+    high: wp.float64
 
 
 @wp.func
-def add_candidates(
-    found: Roots,
-    count: int,
-    mu: wp.float64,
-    eq1: wp.vec3d,
-    v: wp.vec3d,
-    d: wp.vec3d,
-    eye: wp.vec3d,
-    target: wp.vec3d,
-    a: wp.vec3d,
-    b: wp.float64,
-    c: wp.float64,
-    sheet: int,
-    symmetric: int,
-):
-    """Polish both points of the pencil at mu that lie on the surface; keep what becomes a new root."""
+def resultant_at(pencil: Pencil, x: wp.float64):
+    """F at parameter x of the interval."""
+    mu = scan_node(x, pencil.low, pencil.high)
+    f, _e2 = pencil_resultant(mu, pencil.o, pencil.v, pencil.d, pencil.a, pencil.b, pencil.c, pencil.equal)
+    return f
+
+
+@wp.func
+def add_candidates(found: Roots, count: int, pencil: Pencil, x: wp.float64):
+    """Polish both points of the pencil at x that fulfil E2; keep what becomes a new root."""
     zero = wp.float64(0.0)
     one = wp.float64(1.0)
-    slack = wp.float64(1.0e-3)
-    a1 = eq1[0]
-    hb = wp.float64(0.5) * eq1[1]
-    c1 = eq1[2]
+    mu = scan_node(x, pencil.low, pencil.high)
+    _f, e2 = pencil_resultant(mu, pencil.o, pencil.v, pencil.d, pencil.a, pencil.b, pencil.c, pencil.equal)
+    # E2 gives t well also where the line through the pencil touches the surface (E1) or eye and target meet.
+    a2 = e2[0]
+    hb = wp.float64(0.5) * e2[1]
+    c2 = e2[2]
     # A root that touches: the pair may have become complex by rounding, its real part still starts Newton.
-    disc = wp.sqrt(wp.max(hb * hb - a1 * c1, zero))
+    disc = wp.sqrt(wp.max(hb * hb - a2 * c2, zero))
     k = -hb - wp.where(hb < zero, -disc, disc)
-    t_first = wp.float64(-1.0)
-    t_second = wp.float64(-1.0)
-    if a1 != zero:
-        t_first = k / a1
+    t_first = -one
+    t_second = -one
+    if a2 != zero:
+        t_first = k / a2
     if k != zero:
-        t_second = c1 / k
+        t_second = c2 / k
     for j in range(2):
         t = t_first
         if j == 1:
             t = t_second
-        if t > -slack and t < one + slack:
-            start = pencil_point(mu, t, v, d, a, b)
-            root = polish_root(start, eye, target, a, b, c)
-            if sheet != 0 and root.point[2] * wp.float64(sheet) <= zero:
+        if t > -T_SLACK and t < one + T_SLACK:
+            w = pencil.v + t * pencil.d
+            start = wp.vec3d(
+                w[0] / (one + mu * pencil.a[0]),
+                w[1] / (one + mu * pencil.a[1]),
+                (w[2] - mu * pencil.b) / (one + mu * pencil.a[2]),
+            )
+            root = polish_root(start, pencil.eye, pencil.target, pencil.a, pencil.b, pencil.c)
+            if pencil.sheet != 0 and root.point[2] * wp.float64(pencil.sheet) <= zero:
                 root.valid = int(0)
-            found, count = add_root(found, count, root, symmetric)
+            found, count = add_root(found, count, root, pencil.symmetric)
+    return found, count
+
+
+@wp.func
+def bracketed_root(pencil: Pencil, xa: wp.float64, xb: wp.float64, fa: wp.float64, fb: wp.float64):
+    """The root of F between xa and xb (fa, fb of opposite sign): Illinois, every third step a bisection."""
+    zero = wp.float64(0.0)
+    half = wp.float64(0.5)
+    a = xa
+    b = xb
+    ga = fa
+    gb = fb
+    x = half * (a + b)
+    for k in range(ROOT_STEPS):
+        x = half * (a + b)
+        if k % 3 != 2:
+            x = b - gb * ((b - a) / (gb - ga))
+        f = resultant_at(pencil, x)
+        if f == zero or wp.abs(b - a) < ROOT_WIDTH:
+            break
+        if (f > zero) == (gb > zero):
+            ga = ga * half
+        else:
+            a = b
+            ga = gb
+        b = x
+        gb = f
+    return x
+
+
+@wp.func
+def lowest_in_dip(pencil: Pencil, xa: wp.float64, xb: wp.float64, sign: wp.float64):
+    """Where sign * F is smallest between xa and xb, by golden section; ends early where it crosses zero."""
+    a = xa
+    b = xb
+    x = b - GOLDEN * (b - a)
+    y = a + GOLDEN * (b - a)
+    fx = sign * resultant_at(pencil, x)
+    fy = sign * resultant_at(pencil, y)
+    start = wp.max(fx, fy)
+    for k in range(DIP_STEPS):
+        if fx < wp.float64(0.0) or fy < wp.float64(0.0):
+            break
+        if k == DIP_DOUBT and wp.min(fx, fy) > TOUCH_SHARE * start:
+            break
+        if fx < fy:
+            b = y
+            y = x
+            fy = fx
+            x = b - GOLDEN * (b - a)
+            fx = sign * resultant_at(pencil, x)
+        else:
+            a = x
+            x = y
+            fx = fy
+            y = a + GOLDEN * (b - a)
+            fy = sign * resultant_at(pencil, y)
+    if fx < fy:
+        return x, fx
+    return y, fy
+
+
+@wp.func
+def search_cell(found: Roots, count: int, pencil: Pencil, xa: wp.float64, xb: wp.float64):
+    """Look closely at one cell of the scan: sign changes, and dips that may hide two roots."""
+    zero = wp.float64(0.0)
+    step = CELL_STEP * (xb - xa)
+    # One node beyond either end, so that a dip at an end is seen.
+    x0 = xa - step
+    x1 = xa
+    f0 = resultant_at(pencil, x0)
+    f1 = resultant_at(pencil, x1)
+    for k in range(1, wp.static(CELL_NODES + 2)):
+        x2 = xa + step * wp.float64(k)
+        f2 = resultant_at(pencil, x2)
+        if (f1 > zero) != (f2 > zero):
+            if k <= CELL_NODES:
+                x = bracketed_root(pencil, x1, x2, f1, f2)
+                found, count = add_candidates(found, count, pencil, x)
+        elif (f0 > zero) == (f1 > zero) and wp.abs(f1) <= wp.abs(f0) and wp.abs(f1) <= wp.abs(f2):
+            sign = wp.where(f1 > zero, wp.float64(1.0), wp.float64(-1.0))
+            x, f = lowest_in_dip(pencil, x0, x2, sign)
+            if f < zero:
+                x_left = bracketed_root(pencil, x0, x, f0, sign * f)
+                found, count = add_candidates(found, count, pencil, x_left)
+                x = bracketed_root(pencil, x2, x, f2, sign * f)
+            if f < TOUCH_SHARE * wp.min(wp.abs(f0), wp.abs(f2)):
+                found, count = add_candidates(found, count, pencil, x)
+        x0 = x1
+        f0 = f1
+        x1 = x2
+        f1 = f2
     return found, count
 
 
@@ -341,16 +454,15 @@ def off_symmetry(o: wp.vec3d, v: wp.vec3d, a: wp.vec3d, equal: int):
     """
     zero = wp.float64(0.0)
     size = SPLIT * wp.max(wp.float64(1.0), wp.min(wp.length(o), wp.length(v)))
-    golden = wp.float64(0.6180339887498949)
     so = o
     sv = v
     if equal == 1:
         if a[0] < zero and wp.abs(o[0]) + wp.abs(v[0]) < size:
             so = so + wp.vec3d(size, zero, zero)
-            sv = sv + wp.vec3d(golden * size, zero, zero)
+            sv = sv + wp.vec3d(GOLDEN * size, zero, zero)
         if a[1] < zero and wp.abs(o[1]) + wp.abs(v[1]) < size:
             so = so + wp.vec3d(zero, size, zero)
-            sv = sv + wp.vec3d(zero, golden * size, zero)
+            sv = sv + wp.vec3d(zero, GOLDEN * size, zero)
     if equal == 2:
         area = wp.abs(o[0] * v[1] - o[1] * v[0])
         r_o = wp.sqrt(o[0] * o[0] + o[1] * o[1])
@@ -358,7 +470,7 @@ def off_symmetry(o: wp.vec3d, v: wp.vec3d, a: wp.vec3d, equal: int):
         if a[0] < zero:
             if r_o + r_v < size:
                 so = so + wp.vec3d(size, zero, zero)
-                sv = sv + wp.vec3d(golden * size, zero, zero)
+                sv = sv + wp.vec3d(GOLDEN * size, zero, zero)
             elif area < size * wp.max(r_o, r_v):
                 if r_v >= r_o:
                     so = so + (size / r_v) * wp.vec3d(-v[1], v[0], zero)
@@ -367,13 +479,13 @@ def off_symmetry(o: wp.vec3d, v: wp.vec3d, a: wp.vec3d, equal: int):
     if equal < 3:
         if a[2] < zero and wp.abs(o[2]) + wp.abs(v[2]) < size:
             so = so + wp.vec3d(zero, zero, size)
-            sv = sv + wp.vec3d(zero, zero, golden * size)
+            sv = sv + wp.vec3d(zero, zero, GOLDEN * size)
     if equal == 3 and a[0] < zero:
         r_o = wp.length(o)
         r_v = wp.length(v)
         if r_o + r_v < size:
             so = so + wp.vec3d(size, zero, zero)
-            sv = sv + wp.vec3d(golden * size, zero, zero)
+            sv = sv + wp.vec3d(GOLDEN * size, zero, zero)
         elif wp.length(wp.cross(o, v)) < size * wp.max(r_o, r_v):
             if r_v >= r_o:
                 side, _other = tangent_basis(v / r_v)
@@ -406,124 +518,70 @@ def all_reflections(
         (rows of `Roots`, count).
     """
     zero = wp.float64(0.0)
+    one = wp.float64(1.0)
     found = Roots()
     count = int(0)
-    symmetric = on_one_axis(eye, target, equal)
+    pencil = Pencil()
     o, v = off_symmetry(eye, target, a, equal)
-    d = o - v
-    # Poles at mu > 0, ascending.
-    p0 = wp.float64(-1.0)
-    p1 = wp.float64(-1.0)
-    p2 = wp.float64(-1.0)
+    pencil.o = o
+    pencil.v = v
+    pencil.d = o - v
+    pencil.eye = eye
+    pencil.target = target
+    pencil.a = a
+    pencil.b = b
+    pencil.c = c
+    pencil.equal = equal
+    pencil.sheet = sheet
+    pencil.symmetric = on_one_axis(eye, target, equal)
+    # Poles at mu > 0.
+    p0 = -one
+    p1 = -one
+    p2 = -one
     if a[0] < zero:
-        p0 = wp.float64(-1.0) / a[0]
+        p0 = -one / a[0]
     if equal < 2 and a[1] < zero:
-        p1 = wp.float64(-1.0) / a[1]
+        p1 = -one / a[1]
     if equal < 3 and a[2] < zero:
-        p2 = wp.float64(-1.0) / a[2]
+        p2 = -one / a[2]
     low = zero
-    span = wp.float64(1.0) / wp.max(wp.max(wp.abs(a[0]), wp.abs(a[1])), wp.abs(a[2]))
     for _interval in range(4):
         # The next pole above low.
-        high = wp.float64(-1.0)
+        high = -one
         if p0 > low:
             high = p0
         if p1 > low and (high < zero or p1 < high):
             high = p1
         if p2 > low and (high < zero or p2 < high):
             high = p2
-        last = int(0)
-        base = low
-        if high < zero:
-            last = int(1)
-            if low == zero:
-                # No pole at all: one finite piece, then the tail.
-                high = span
-                last = int(0)
-        x0 = wp.float64(0.0)
-        x1 = wp.float64(0.0)
-        f0 = wp.float64(0.0)
-        f1 = wp.float64(0.0)
-        for k in range(1, SCAN_NODES):
-            x2 = wp.float64(k) / wp.float64(SCAN_NODES)
-            mu = scan_node(x2, base, high)
-            f2, eq1 = pencil_resultant(mu, o, v, d, a, b, c, equal)
-            if k > 1 and (f1 > zero) != (f2 > zero):
-                xa = x1
-                xb = x2
-                fa = f1
-                for _j in range(BISECTIONS):
-                    xm = wp.float64(0.5) * (xa + xb)
-                    fm, eq1 = pencil_resultant(scan_node(xm, base, high), o, v, d, a, b, c, equal)
-                    if (fm > zero) == (fa > zero):
-                        xa = xm
-                    else:
-                        xb = xm
-                mu = scan_node(xa, base, high)
-                fm, eq1 = pencil_resultant(mu, o, v, d, a, b, c, equal)
-                found, count = add_candidates(
-                    found, count, mu, eq1, v, d, eye, target, a, b, c, sheet, symmetric
-                )
-            elif (
-                k > 2 and wp.abs(f1) <= wp.abs(f0) and wp.abs(f1) <= wp.abs(f2) and (f0 > zero) == (f1 > zero)
-            ):
-                # A dip towards zero: two roots close together, or one that touches (equal mu, different t).
-                sign = wp.where(f1 > zero, wp.float64(1.0), wp.float64(-1.0))
-                ratio = wp.float64(0.6180339887498949)
-                xa = x0
-                xb = x2
-                xl = xb - ratio * (xb - xa)
-                xr = xa + ratio * (xb - xa)
-                fl, eq1 = pencil_resultant(scan_node(xl, base, high), o, v, d, a, b, c, equal)
-                fr, eq1 = pencil_resultant(scan_node(xr, base, high), o, v, d, a, b, c, equal)
-                for _j in range(40):
-                    if sign * fl < sign * fr:
-                        xb = xr
-                        xr = xl
-                        fr = fl
-                        xl = xb - ratio * (xb - xa)
-                        fl, eq1 = pencil_resultant(scan_node(xl, base, high), o, v, d, a, b, c, equal)
-                    else:
-                        xa = xl
-                        xl = xr
-                        fl = fr
-                        xr = xa + ratio * (xb - xa)
-                        fr, eq1 = pencil_resultant(scan_node(xr, base, high), o, v, d, a, b, c, equal)
-                    if sign * fl < zero or sign * fr < zero:
-                        break
-                xm = xl
-                if sign * fr < sign * fl:
-                    xm = xr
-                mu = scan_node(xm, base, high)
-                fm, eq1 = pencil_resultant(mu, o, v, d, a, b, c, equal)
-                if sign * fm < zero:
-                    # It crosses after all: one root on either side of the dip.
-                    for side in range(2):
-                        xa = x0
-                        if side == 1:
-                            xa = x2
-                        xb = xm
-                        for _j in range(BISECTIONS):
-                            x = wp.float64(0.5) * (xa + xb)
-                            fm, eq1 = pencil_resultant(scan_node(x, base, high), o, v, d, a, b, c, equal)
-                            if sign * fm > zero:
-                                xa = x
-                            else:
-                                xb = x
-                        mu = scan_node(xb, base, high)
-                        fm, eq1 = pencil_resultant(mu, o, v, d, a, b, c, equal)
-                        found, count = add_candidates(
-                            found, count, mu, eq1, v, d, eye, target, a, b, c, sheet, symmetric
-                        )
-                else:
-                    found, count = add_candidates(
-                        found, count, mu, eq1, v, d, eye, target, a, b, c, sheet, symmetric
-                    )
-            x0 = x1
+        if high < zero and low == zero:
+            # No pole at all: one finite piece, then the tail.
+            high = one / wp.max(wp.max(wp.abs(a[0]), wp.abs(a[1])), wp.abs(a[2]))
+        pencil.low = low
+        pencil.high = high
+        step = SCAN_STEP
+        f0 = resultant_at(pencil, wp.float64(0.25) * step)
+        f1 = resultant_at(pencil, step)
+        f2 = resultant_at(pencil, step + step)
+        for k in range(3, wp.static(SCAN_NODES + 1)):
+            # The cell between f1 and f2, its neighbours on either side.
+            x3 = wp.min(wp.float64(k), LAST_NODE) * step
+            f3 = resultant_at(pencil, x3)
+            before = wp.abs(f1 - f0)
+            across = wp.abs(f2 - f1)
+            after = wp.abs(f3 - f2)
+            suspect = (f1 > zero) != (f2 > zero)
+            # A flat piece between steep ones: a root more on either side of it, or two within.
+            suspect = suspect or across < wp.float64(0.5) * wp.min(before, after)
+            suspect = suspect or (wp.abs(f1) <= wp.abs(f0) and wp.abs(f1) <= wp.abs(f2))
+            suspect = suspect or (wp.abs(f2) <= wp.abs(f1) and wp.abs(f2) <= wp.abs(f3))
+            if suspect:
+                xb = wp.float64(k - 1) * step
+                found, count = search_cell(found, count, pencil, xb - step, xb)
             f0 = f1
-            x1 = x2
             f1 = f2
-        if last == 1:
+            f2 = f3
+        if high < zero:
             break
         low = high
     return found, count

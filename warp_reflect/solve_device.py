@@ -26,7 +26,8 @@ from warp_reflect.quadrics import (
 )
 from warp_reflect.settings import Status
 
-wp.set_module_options({"enable_backward": False})
+# Unrolled, the searches in loops of known length would be compiled many times over.
+wp.set_module_options({"enable_backward": False, "max_unroll": 2})
 
 CONVERGED = wp.constant(int(Status.CONVERGED))
 HIDDEN = wp.constant(int(Status.HIDDEN))
@@ -98,7 +99,7 @@ def signed_distance(x: wp.vec3d, lam: wp.vec3d, b: wp.float64, c: wp.float64):
 
 @wp.func
 def chord_enters(eye: wp.vec3d, target: wp.vec3d, lam: wp.vec3d, b: wp.float64, c: wp.float64, sheet: int):
-    """True if the segment between two outsiders enters the body (sheet != 0: its part with that sign of z)."""
+    """True if the segment between outsiders enters the body (sheet != 0: its part with that sign of z)."""
     d = target - eye
     aa = quadric_curve(d, d, lam)
     hb = wp.dot(quadric_half_gradient(eye, lam, b), d)
