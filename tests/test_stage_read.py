@@ -30,9 +30,7 @@ def test_missing_file_is_named(tmp_path):
         read_stage(tmp_path / "nowhere.usda")
 
 
-@pytest.mark.parametrize(
-    "content", [b"", b"\xff\xfe#usda 1.0", b"PXR-USDC\x00\x00", b"#usda 1.0\ndef Xform {"]
-)
+@pytest.mark.parametrize("content", [b"", b"\xff\xfe#usda 1.0", b"PXR-USDC\x00\x00", b"#usda 1.0\ndef Xform {"])
 def test_unreadable_file_is_one_line(tmp_path, content, capfd):
     path = tmp_path / "broken.usda"
     path.write_bytes(content)
@@ -79,16 +77,12 @@ def test_left_handed_mesh_faces_outward(stage):
 
 def test_left_handed_corners_keep_their_values(stage):
     mesh = samples.add_quad(stage, "/Quad")
-    colors = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar(
-        "displayColor", Sdf.ValueTypeNames.Color3fArray, "faceVarying"
-    )
+    colors = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("displayColor", Sdf.ValueTypeNames.Color3fArray, "faceVarying")
     values = [Gf.Vec3f(*p) for p in samples.QUAD_POINTS]
     colors.Set(values)
     mesh.CreateOrientationAttr("leftHanded")
     drawn = read(stage).meshes[0]
-    np.testing.assert_array_equal(
-        corner_values(drawn.colors, drawn.color_index, drawn), drawn.points[drawn.triangles]
-    )
+    np.testing.assert_array_equal(corner_values(drawn.colors, drawn.color_index, drawn), drawn.points[drawn.triangles])
 
 
 def test_normals_primvar_wins_over_attribute(stage):
@@ -98,9 +92,7 @@ def test_normals_primvar_wins_over_attribute(stage):
     primvar = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("normals", Sdf.ValueTypeNames.Normal3fArray, "uniform")
     primvar.Set([Gf.Vec3f(0, 3, 4)])
     drawn = read(stage).meshes[0]
-    np.testing.assert_allclose(
-        corner_values(drawn.normals, drawn.normal_index, drawn), [[[0, 0.6, 0.8]] * 3] * 2
-    )
+    np.testing.assert_allclose(corner_values(drawn.normals, drawn.normal_index, drawn), [[[0, 0.6, 0.8]] * 3] * 2)
 
 
 @pytest.mark.parametrize("interpolation", ["constant", "uniform", "vertex", "varying", "faceVarying"])
@@ -111,9 +103,7 @@ def test_primvar_interpolations_reach_the_corners(stage, interpolation, indexed)
     rng = np.random.default_rng(3)
     values = rng.uniform(size=(count, 3)).astype(np.float32)
     index = rng.permutation(count)
-    primvar = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar(
-        "normals", Sdf.ValueTypeNames.Normal3fArray, interpolation
-    )
+    primvar = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("normals", Sdf.ValueTypeNames.Normal3fArray, interpolation)
     primvar.Set(Vt.Vec3fArray.FromNumpy(values))
     expected = values
     if indexed:
@@ -133,14 +123,10 @@ def test_primvar_interpolations_reach_the_corners(stage, interpolation, indexed)
 
 def test_bad_normals_become_face_normals(stage):
     mesh = samples.add_quad(stage, "/Quad")
-    mesh.CreateNormalsAttr(
-        [Gf.Vec3f(0, 0, 0), Gf.Vec3f(np.nan, 0, 0), Gf.Vec3f(0, 1e30, 0), Gf.Vec3f(0, 1e-30, 0)]
-    )
+    mesh.CreateNormalsAttr([Gf.Vec3f(0, 0, 0), Gf.Vec3f(np.nan, 0, 0), Gf.Vec3f(0, 1e30, 0), Gf.Vec3f(0, 1e-30, 0)])
     mesh.SetNormalsInterpolation("vertex")
     data = read(stage)
-    np.testing.assert_allclose(
-        data.meshes[0].normals, [(0, 0, 1), (0, 0, 1), (0, 1, 0), (0, 1, 0)], atol=1e-7
-    )
+    np.testing.assert_allclose(data.meshes[0].normals, [(0, 0, 1), (0, 0, 1), (0, 1, 0), (0, 1, 0)], atol=1e-7)
     assert any("normals[0]: got (0.0, 0.0, 0.0); 2 replaced" in text for text in texts(data))
 
 
@@ -518,9 +504,7 @@ def Mesh "Double"
     data = read_stage(path)
     assert [i.prim_path for i in data.instances] == ["/Double"]
     assert any("/Text: faceVertexCounts: got str, expected int[]" in text for text in texts(data))
-    assert any(
-        "/FloatIndices: faceVertexIndices: got FloatArray, expected int[]" in text for text in texts(data)
-    )
+    assert any("/FloatIndices: faceVertexIndices: got FloatArray, expected int[]" in text for text in texts(data))
 
 
 def test_unreferenced_bad_point_is_harmless(stage):
@@ -584,9 +568,7 @@ def test_units_axis_and_times_are_read(stage):
     )
 
 
-@pytest.mark.parametrize(
-    "text", ["metersPerUnit = 0", "metersPerUnit = nan", 'upAxis = "X"', "timeCodesPerSecond = 0"]
-)
+@pytest.mark.parametrize("text", ["metersPerUnit = 0", "metersPerUnit = nan", 'upAxis = "X"', "timeCodesPerSecond = 0"])
 def test_bad_stage_metadata_is_replaced(tmp_path, text):
     path = tmp_path / "meta.usda"
     path.write_text(f"#usda 1.0\n(\n    {text}\n)\n")

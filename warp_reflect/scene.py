@@ -93,8 +93,26 @@ class InstanceData:
 
 
 @dataclass(frozen=True)
+class TextureRef:
+    """A picture that drives a material parameter: value = scale * texel + bias, of `channel`."""
+
+    file: str  # resolved; "package.usdz[inside.png]" where packed
+    channel: str = "rgb"  # or "r", "g", "b", "a"
+    color_space: str = "auto"  # "sRGB", "raw"; "raw" wherever the parameter is no colour
+    wrap: tuple[str, str] = ("useMetadata", "useMetadata")  # or "repeat", "clamp", "mirror", "black"
+    scale: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
+    bias: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    uv_name: str = "st"  # the primvar in MeshData.uvs
+    # Rows of the affine map from the primvar to picture coordinates, u right and v up: [u, v] = m @ [s, t, 1].
+    uv_from_st: tuple[tuple[float, float, float], tuple[float, float, float]] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+
+
+@dataclass(frozen=True)
 class MaterialData:
-    """UsdPreviewSurface parameters; colours linear Rec.709."""
+    """UsdPreviewSurface parameters; colours linear Rec.709.
+
+    A parameter with a texture holds what to use without it: the texture's fallback.
+    """
 
     path: str = ""
     base_color: tuple[float, float, float] = (0.18, 0.18, 0.18)
@@ -108,17 +126,20 @@ class MaterialData:
     clearcoat: float = 0.0
     clearcoat_roughness: float = 0.01
     uses_vertex_color: bool = False  # base_color is replaced by MeshData.colors
+    textures: dict[str, TextureRef] = field(default_factory=dict)  # by field name: "base_color", "roughness" ...
 
 
 @dataclass(frozen=True)
 class LightData:
-    """A dome (radiance from all sides) or a distant light."""
+    """A dome (radiance from all sides), a distant light, or a shape that emits the same radiance everywhere."""
 
     path: str
-    kind: str  # "dome" | "distant"
-    color: tuple[float, float, float]  # dome: radiance; distant: irradiance on a facing surface
-    world_from_light: np.ndarray  # float64 [4, 4]; a distant light shines along its -Z
+    kind: str  # "dome" | "distant" | "sphere" | "rect" | "disk" | "cylinder"
+    color: tuple[float, float, float]  # distant: irradiance on a facing surface; all others: radiance
+    world_from_light: np.ndarray  # float64 [4, 4]; distant, rect and disk shine along -Z, a cylinder lies along X
     texture: np.ndarray | None = None  # float32 [h, w, 3], linear, latlong in OpenEXR orientation
+    # In the light's frame; sphere, disk: (radius,), rect: (width, height), cylinder: (length, radius).
+    size: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -153,6 +174,7 @@ class SceneData:
     time: float | None = None
     time_range: tuple[float, float] | None = None
     time_codes_per_second: float = 24.0
+    collections: dict[str, tuple[str, ...]] = field(default_factory=dict)  # "/Prim.collection:name" to member paths
 
 
 # Shape kinds on the device.

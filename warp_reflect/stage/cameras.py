@@ -43,9 +43,7 @@ def read_camera(prim, world_from_camera: np.ndarray, intake: Intake) -> CameraDa
         vertical_aperture=number(camera.GetVerticalApertureAttr(), intake.time, 0.0, open_low=True),
         horizontal_offset=number(camera.GetHorizontalApertureOffsetAttr(), intake.time),
         vertical_offset=number(camera.GetVerticalApertureOffsetAttr(), intake.time),
-        focal_length=number(camera.GetFocalLengthAttr(), intake.time, 0.0, open_low=True)
-        if perspective
-        else 50.0,
+        focal_length=number(camera.GetFocalLengthAttr(), intake.time, 0.0, open_low=True) if perspective else 50.0,
         near=near,
         far=min(far, 1.0e30),  # infinity is legal in USD; a depth must stay finite in float32
     )

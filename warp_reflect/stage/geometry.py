@@ -1,4 +1,4 @@
-"""UsdGeomMesh and the analytic gprims to `MeshData`: validation, corner attributes, material subsets."""
+"""UsdGeomMesh and the analytic gprims to `MeshData`: validation, subdivision, material subsets."""
 
 from __future__ import annotations
 
@@ -10,20 +10,15 @@ from pxr import UsdGeom, UsdShade
 from warp_reflect.scene import MeshData, Part
 from warp_reflect.stage import gprims
 from warp_reflect.stage.intake import COORDINATE_MAX, BadPrim, Intake, floats, integers, number, token
+from warp_reflect.stage.primvars import CornerAttribute, read_primvar, read_uvs
+from warp_reflect.stage.subdivide import BOUNDARY_RULES, Cage, subdivide
 from warp_reflect.stage.triangulate import triangulate
 
-# Squared relative size under which a triangle has no plane: the cross product of its edges against their
-# length.
+# Relative area under which a triangle has no plane: the cross product of its edges over the longest edge
+# squared.
 DEGENERATE_AREA = 1.0e-12
-
-
-@dataclass
-class CornerAttribute:
-    """A primvar: `values[index[element]]`, where `interpolation` says what an element is."""
-
-    values: np.ndarray  # float64 [n, width]
-    index: np.ndarray | None  # int64 [element_count]; None: element i is value i
-    interpolation: str
+SMOOTH_SCHEMES = ("catmullClark", "loop")
+REFINED_FACES_MAX = 4_000_000  # of one mesh; above it the level is lowered (about 1 GB while refining)
 
 
 def read_gprim(prim, intake: Intake, level: int) -> MeshData:
@@ -73,13 +68,37 @@ def read_gprim(prim, intake: Intake, level: int) -> MeshData:
     return mesh
 
 
-def read_mesh(prim, intake: Intake, level: int) -> tuple[MeshData, list]:
+@dataclass
+class _Surface:
+    """A validated polygon mesh between reading and triangulation.
+
+    Attributes:
+        points: float64 [point_count, 3].
+        counts, indices: Faces, int64.
+        source: Face of the authored mesh each face belongs to, int64 [face_count].
+        drawn: bool [face_count].
+        attributes: What follows the corners, by name: "normals", "colors", "uvs".
+    """
+
+    points: np.ndarray
+    counts: np.ndarray
+    indices: np.ndarray
+    source: np.ndarray
+    drawn: np.ndarray
+    attributes: dict[str, CornerAttribute]
+
+
+def read_mesh(
+    prim, intake: Intake, level: int, uv_name: str = "", color_name: str = "displayColor"
+) -> tuple[MeshData, list]:
     """A UsdGeomMesh in object space.
 
     Args:
         prim: The mesh prim.
         intake: The reading; repairs are noted there.
-        level: Subdivision level.
+        level: Subdivision level; 0: the cage. Without effect on polygon meshes.
+        uv_name: Primvar that becomes the UVs; empty: none is read.
+        color_name: Primvar that becomes the colours, where it varies over the mesh.
 
     Returns:
         (mesh, subsets): one GeomSubset prim per part, None for the part with the mesh's own material.
@@ -89,6 +108,91 @@ def read_mesh(prim, intake: Intake, level: int) -> tuple[MeshData, list]:
     """
     path = prim.GetPath()
     mesh = UsdGeom.Mesh(prim)
+    surface = _authored(mesh, intake, uv_name, color_name)
+    face_count = len(surface.counts)
+    scheme = subdivision_scheme(prim, intake)
+    if scheme in SMOOTH_SCHEMES and level > 0:
+        surface = _refined(mesh, surface, scheme, level, intake)
+    elif scheme in SMOOTH_SCHEMES and not len(mesh.GetCreaseLengthsAttr().Get(intake.time) or ()):
+        surface.attributes["normals"] = _point_normals(surface)
+
+    starts = np.cumsum(surface.counts) - surface.counts
+    kept = np.flatnonzero(surface.drawn)
+    corner_of_kept = _ranges(starts[kept], surface.counts[kept])
+    corners, face, crossing = triangulate(surface.counts[kept], surface.indices[corner_of_kept], surface.points)
+    corners, face = corner_of_kept[corners], kept[face]
+    triangles = surface.indices[corners]
+    solid = _has_area(surface.points, triangles)
+    if not solid.all():
+        intake.note(path, f"faceVertexIndices: {np.sum(~solid)} triangles without area dropped")
+        corners, face, triangles = corners[solid], face[solid], triangles[solid]
+    crossing = np.intersect1d(kept[crossing], face)
+    if len(crossing):
+        first = surface.source[crossing[0]]
+        intake.note(path, f"faceVertexIndices: face {first} crosses itself, as do {len(crossing) - 1} more")
+    if not len(triangles):
+        raise BadPrim("points: got no face with an area, expected one")
+
+    part_of_face, subsets = _material_subsets(mesh, face_count, intake)
+    part = part_of_face[surface.source[face]]
+    order = np.argsort(part, kind="stable")
+    corners, face, triangles = corners[order], face[order], triangles[order]
+    if mesh.GetOrientationAttr().Get(intake.time) == "leftHanded":
+        corners, triangles = corners[:, [0, 2, 1]], triangles[:, [0, 2, 1]]
+        if scheme in SMOOTH_SCHEMES and "normals" in surface.attributes:
+            surface.attributes["normals"].values *= -1.0  # made by the winding, which is the other way round
+
+    result = MeshData(surface.points.astype(np.float32), triangles.astype(np.int32))
+    result.double_sided = bool(mesh.GetDoubleSidedAttr().Get(intake.time))
+    sizes = np.bincount(part, minlength=len(subsets))
+    firsts = np.cumsum(sizes) - sizes
+    named = [
+        (Part(int(f), int(n), s.GetName() if s else ""), s) for f, n, s in zip(firsts, sizes, subsets, strict=True) if n
+    ]
+    result.parts = [each for each, _ in named]
+    placed = {
+        name: (attribute.values, _corner_index(attribute, corners, face, triangles))
+        for name, attribute in surface.attributes.items()
+    }
+    if "normals" in placed:
+        result.normals, result.normal_index = _unit_normals(*placed["normals"], surface.points, triangles, path, intake)
+    if "colors" in placed:
+        result.colors, result.color_index = placed["colors"][0].astype(np.float32), placed["colors"][1]
+    if "uvs" in placed:
+        result.uvs, result.uv_index = placed["uvs"][0].astype(np.float32), placed["uvs"][1]
+    return result, [subset for _, subset in named]
+
+
+def _point_normals(surface: _Surface) -> CornerAttribute:
+    """Normals of a cage drawn as it is: the sum of the area vectors of the faces at each point."""
+    starts = np.cumsum(surface.counts) - surface.counts
+    face_of = np.repeat(np.arange(len(surface.counts)), surface.counts)
+    within = np.arange(len(surface.indices)) - starts[face_of]
+    size = surface.counts[face_of]
+    ahead = surface.indices[starts[face_of] + (within + 1) % size]
+    behind = surface.indices[starts[face_of] + (within - 1) % size]
+    here = surface.points[surface.indices]
+    turn = np.cross(surface.points[ahead] - here, surface.points[behind] - here)
+    turn[~surface.drawn[face_of]] = 0.0
+    columns = [np.bincount(surface.indices, turn[:, k], len(surface.points)) for k in range(3)]
+    return CornerAttribute(np.stack(columns, axis=1), None, "vertex")
+
+
+def subdivision_scheme(prim, intake: Intake) -> str:
+    """The scheme of a mesh; one that is not authored is catmullClark."""
+    attribute = UsdGeom.Mesh(prim).GetSubdivisionSchemeAttr()
+    scheme = attribute.Get(intake.time)
+    if scheme not in ("none", "bilinear", *SMOOTH_SCHEMES):
+        intake.bad(
+            prim.GetPath(),
+            f"subdivisionScheme: got {scheme!r}, expected none, bilinear, loop or catmullClark; none is used",
+        )
+        return "none"
+    return str(scheme)
+
+
+def _authored(mesh: UsdGeom.Mesh, intake: Intake, uv_name: str, color_name: str) -> _Surface:
+    path, prim = mesh.GetPath(), mesh.GetPrim()
     points, counts, indices = _topology(mesh, intake)
     face_count = len(counts)
     drawn = counts >= 3
@@ -96,46 +200,11 @@ def read_mesh(prim, intake: Intake, level: int) -> tuple[MeshData, list]:
         first = int(np.flatnonzero(~drawn)[0])
         intake.note(
             path,
-            f"faceVertexCounts[{first}]: got {counts[first]}; {np.sum(~drawn)} faces with less than 3 "
-            f"corners dropped",
+            f"faceVertexCounts[{first}]: got {counts[first]}; {np.sum(~drawn)} faces with less than 3 corners dropped",
         )
     drawn &= ~_holes(mesh, face_count, intake)
     if not drawn.any():
         raise BadPrim("faceVertexCounts: got no face with 3 corners or more that is no hole, expected one")
-    starts = np.cumsum(counts) - counts
-    kept = np.flatnonzero(drawn)
-    corner_of_kept = _ranges(starts[kept], counts[kept])
-    corners, face, crossing = triangulate(counts[kept], indices[corner_of_kept], points)
-    corners, face = corner_of_kept[corners], kept[face]
-    triangles = indices[corners]
-    solid = _has_area(points, triangles)
-    if not solid.all():
-        intake.note(path, f"faceVertexIndices: {np.sum(~solid)} triangles without area dropped")
-        corners, face, triangles = corners[solid], face[solid], triangles[solid]
-    crossing = np.intersect1d(kept[crossing], face)
-    if len(crossing):
-        intake.note(
-            path, f"faceVertexIndices: face {crossing[0]} crosses itself, as do {len(crossing) - 1} more"
-        )
-    if not len(triangles):
-        raise BadPrim("points: got no face with an area, expected one")
-
-    part_of_face, subsets = _material_subsets(mesh, face_count, intake)
-    order = np.argsort(part_of_face[face], kind="stable")
-    corners, face, triangles = corners[order], face[order], triangles[order]
-    if mesh.GetOrientationAttr().Get(intake.time) == "leftHanded":
-        corners, triangles = corners[:, [0, 2, 1]], triangles[:, [0, 2, 1]]
-
-    result = MeshData(points.astype(np.float32), triangles.astype(np.int32))
-    result.double_sided = bool(mesh.GetDoubleSidedAttr().Get(intake.time))
-    sizes = np.bincount(part_of_face[face], minlength=len(subsets))
-    firsts = np.cumsum(sizes) - sizes
-    named = [
-        (Part(int(f), int(n), s.GetName() if s else ""), s)
-        for f, n, s in zip(firsts, sizes, subsets, strict=True)
-        if n
-    ]
-    result.parts = [part for part, _ in named]
     elements = {
         "constant": 1,
         "uniform": face_count,
@@ -143,57 +212,161 @@ def read_mesh(prim, intake: Intake, level: int) -> tuple[MeshData, list]:
         "varying": len(points),
         "faceVarying": len(indices),
     }
-
-    def placed(attribute: CornerAttribute | None, name: str) -> tuple[np.ndarray, np.ndarray] | None:
-        """(values float64 [n, width], index int32 [triangle_count, 3]); None where it does not fit."""
+    found = {}
+    # Subdivided surfaces have their own normals; authored ones are ignored (UsdGeomMesh).
+    if subdivision_scheme(prim, intake) == "none":
+        found["normals"] = _normals(mesh, intake)
+    color = read_primvar(prim, color_name, 3, intake)
+    if color is not None and color.interpolation != "constant":
+        found["colors"] = color, f"primvars:{color_name}"
+    if uv_name:
+        found["uvs"] = read_uvs(prim, uv_name, intake)
+    attributes = {}
+    for name, (attribute, label) in found.items():
         if attribute is None:
-            return None
-        count = len(attribute.values) if attribute.index is None else len(attribute.index)
-        expected = elements[attribute.interpolation]
-        if count != expected and not (expected == 1 and count > 1):
+            continue
+        count, expected = attribute.element_count, elements[attribute.interpolation]
+        if count == expected or (attribute.interpolation == "constant" and count > 1):
+            attributes[name] = attribute
+        else:
             intake.bad(
                 path,
-                f"{name}: got {count} values, expected {expected} for {attribute.interpolation}; not used",
+                f"{label}: got {count} values, expected {expected} for {attribute.interpolation}; not used",
             )
-            return None
-        if attribute.interpolation == "constant":
-            index = np.zeros_like(triangles)
+    return _Surface(points, counts, indices, np.arange(face_count), drawn, attributes)
+
+
+def _refined(mesh: UsdGeom.Mesh, surface: _Surface, scheme: str, level: int, intake: Intake) -> _Surface:
+    """The surface subdivided onto its limit."""
+    path = mesh.GetPath()
+    counts, indices, attributes = surface.counts, surface.indices, surface.attributes
+    # A corner that repeats the one before it adds no edge: without this it would count as a border.
+    starts = np.cumsum(counts) - counts
+    face_of = np.repeat(np.arange(len(counts)), counts)
+    last = np.arange(len(indices)) + 1 == (starts + counts)[face_of]
+    following = np.where(last, starts[face_of], np.arange(len(indices)) + 1)
+    solid = indices != indices[following]
+    left = np.bincount(face_of[solid], minlength=len(counts))
+    faces = np.flatnonzero(left >= 3)
+    corners = np.flatnonzero(solid & (left >= 3)[face_of])
+    if scheme == "loop" and (left[faces] != 3).any():
+        intake.note(path, "subdivisionScheme: loop on faces that are no triangles; catmullClark is used")
+        scheme = "catmullClark"
+    while level > 0 and len(corners) * 4 ** (level - 1) > REFINED_FACES_MAX:
+        level -= 1
+        intake.note(path, f"level {level} instead of {level + 1}: more than {REFINED_FACES_MAX} faces")
+    if level == 0 or not len(faces):
+        return surface
+    if mesh.GetTriangleSubdivisionRuleAttr().Get(intake.time) == "smooth":
+        intake.note(path, "triangleSubdivisionRule: smooth is not used; catmullClark is")
+    creases, sharpness = _creases(mesh, len(surface.points), intake)
+    sharp_points, point_sharpness = _sharp_points(mesh, len(surface.points), intake)
+    boundary = mesh.GetInterpolateBoundaryAttr().Get(intake.time)
+    cage = Cage(
+        left[faces],
+        indices[corners],
+        boundary if boundary in BOUNDARY_RULES else BOUNDARY_RULES[-1],
+        creases,
+        sharpness,
+        sharp_points,
+        point_sharpness,
+        ~surface.drawn[faces],
+    )
+    # Values of each kind side by side, as columns that are refined together.
+    columns: dict[str, list[np.ndarray]] = {"vertex": [surface.points], "varying": [], "faceVarying": []}
+    spans: dict[str, slice] = {}
+    for name, attribute in attributes.items():
+        if attribute.interpolation in columns:
+            values = attribute.flat()
+            if attribute.interpolation == "faceVarying":
+                values = values[corners]
+            first = sum(each.shape[1] for each in columns[attribute.interpolation])
+            spans[name] = slice(first, first + values.shape[1])
+            columns[attribute.interpolation].append(values)
+    stacked = {kind: np.concatenate(each, axis=1) if each else None for kind, each in columns.items()}
+    fine = subdivide(scheme, level, cage, stacked["vertex"], stacked["varying"], stacked["faceVarying"])
+    size = fine.indices.shape[1]
+    source = faces[fine.source]
+    results = {"vertex": fine.points, "varying": fine.varying}
+    if fine.face_varying is not None:
+        results["faceVarying"] = fine.face_varying.reshape(-1, fine.face_varying.shape[2])
+    refined = {"normals": CornerAttribute(fine.normals, fine.normal_index.reshape(-1), "faceVarying")}
+    for name, attribute in attributes.items():
+        if name in spans:
+            values = results[attribute.interpolation][:, spans[name]]
+            refined[name] = CornerAttribute(values, None, attribute.interpolation)
         elif attribute.interpolation == "uniform":
-            index = np.repeat(face[:, None], 3, axis=1)
+            refined[name] = CornerAttribute(attribute.flat()[source], None, "uniform")
         else:
-            index = corners if attribute.interpolation == "faceVarying" else triangles
-        if attribute.index is not None:
-            index = attribute.index[index]
-        return attribute.values, index.astype(np.int32)
-
-    smooth = mesh.GetSubdivisionSchemeAttr().Get(intake.time) != "none"
-    normals = None if smooth else placed(*_normals(mesh, intake))
-    if normals is not None:
-        result.normals, result.normal_index = _unit_normals(*normals, points, triangles, path, intake)
-    colors = _primvar(prim, "displayColor", 3, intake)
-    if colors is not None and colors.interpolation != "constant":
-        colors = placed(colors, "primvars:displayColor")
-        if colors is not None:
-            result.colors, result.color_index = colors[0].astype(np.float32), colors[1]
-    return result, [subset for _, subset in named]
+            refined[name] = attribute
+    return _Surface(
+        fine.points[:, :3],
+        np.full(len(fine.indices), size, np.int64),
+        fine.indices.reshape(-1),
+        source,
+        np.ones(len(fine.indices), bool),
+        refined,
+    )
 
 
-def display_color(prim, intake: Intake) -> tuple[tuple[float, float, float] | None, float]:
-    """(mean colour, mean opacity) of primvars displayColor and displayOpacity; None without a colour."""
-    color = _primvar(prim, "displayColor", 3, intake)
-    opacity = _primvar(prim, "displayOpacity", 1, intake)
-    alpha = 1.0
-    if opacity is not None and len(opacity.values):
-        alpha = float(np.clip(opacity.values.mean(), 0.0, 1.0))
-        if opacity.interpolation != "constant" and np.ptp(opacity.values) > 0.0:
-            intake.note(
-                prim.GetPath(), f"primvars:displayOpacity: varies over the mesh; its mean {alpha:g} is used"
-            )
-    if color is None:
-        return None, alpha
-    used = color.values if color.index is None else color.values[color.index]
-    mean = used.mean(axis=0) if color.interpolation != "constant" else used[0]
-    return tuple(float(v) for v in mean), alpha
+def _creases(mesh: UsdGeom.Mesh, point_count: int, intake: Intake) -> tuple[np.ndarray, np.ndarray]:
+    """(edges int64 [n, 2], sharpness float64 [n]) of the creases; malformed ones are noted and left out."""
+    nothing = np.zeros((0, 2), np.int64), np.zeros(0)
+    lengths = integers(mesh.GetCreaseLengthsAttr(), intake.time)
+    if lengths is None or not len(lengths):
+        return nothing
+    indices = integers(mesh.GetCreaseIndicesAttr(), intake.time)
+    values = floats(mesh.GetCreaseSharpnessesAttr(), intake.time, 1)
+    indices = np.zeros(0, np.int64) if indices is None else indices
+    values = np.zeros(0) if values is None else values
+    per_edge = int(np.maximum(lengths - 1, 0).sum())
+    fault = ""
+    if (lengths < 2).any() or lengths.sum() != len(indices):
+        fault = f"creaseLengths: got lengths that sum to {lengths.sum()}, expected {len(indices)}, each >= 2"
+    elif len(values) not in (len(lengths), per_edge):
+        fault = f"creaseSharpnesses: got {len(values)} values, expected {len(lengths)} or {per_edge}"
+    elif ((indices < 0) | (indices >= point_count)).any():
+        fault = f"creaseIndices: got a value outside 0 to {point_count - 1}"
+    elif not (values >= 0.0).all():
+        fault = "creaseSharpnesses: got a value that is no number >= 0"
+    if fault:
+        intake.bad(mesh.GetPath(), f"{fault}; creases not used")
+        return nothing
+    ends = np.zeros(len(indices), bool)
+    ends[np.cumsum(lengths) - 1] = True
+    first = np.flatnonzero(~ends)
+    if len(values) == len(lengths):
+        values = np.repeat(values, lengths - 1)
+    return np.stack([indices[first], indices[first + 1]], axis=1), values
+
+
+def _sharp_points(mesh: UsdGeom.Mesh, point_count: int, intake: Intake) -> tuple[np.ndarray, np.ndarray]:
+    """(points int64 [n], sharpness float64 [n]) of the corners; malformed ones are noted and left out."""
+    indices = integers(mesh.GetCornerIndicesAttr(), intake.time)
+    values = floats(mesh.GetCornerSharpnessesAttr(), intake.time, 1)
+    if indices is None or not len(indices):
+        return np.zeros(0, np.int64), np.zeros(0)
+    count = 0 if values is None else len(values)
+    if count != len(indices) or ((indices < 0) | (indices >= point_count)).any() or not (values >= 0.0).all():
+        intake.bad(
+            mesh.GetPath(),
+            f"cornerIndices, cornerSharpnesses: got {len(indices)} and {count} values, expected as "
+            f"many, points "
+            f"0 to {point_count - 1} and sharpnesses >= 0; corners not used",
+        )
+        return np.zeros(0, np.int64), np.zeros(0)
+    return indices, values
+
+
+def _corner_index(attribute: CornerAttribute, corners, face, triangles) -> np.ndarray:
+    """Index into the attribute's values per triangle corner, int32 [triangle_count, 3]."""
+    if attribute.interpolation == "constant":
+        index = np.zeros_like(triangles)
+    elif attribute.interpolation == "uniform":
+        index = np.repeat(face[:, None], 3, axis=1)
+    else:
+        index = corners if attribute.interpolation == "faceVarying" else triangles
+    return (index if attribute.index is None else attribute.index[index]).astype(np.int32)
 
 
 def _topology(mesh: UsdGeom.Mesh, intake: Intake) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -213,13 +386,10 @@ def _topology(mesh: UsdGeom.Mesh, intake: Intake) -> tuple[np.ndarray, np.ndarra
         raise BadPrim(f"faceVertexCounts[{low}]: got {counts[low]}, expected 3 or more")
     high = int(np.argmax(counts))
     if counts[high] > intake.limits.face_corners:
-        raise BadPrim(
-            f"faceVertexCounts[{high}]: got {counts[high]}, expected at most {intake.limits.face_corners}"
-        )
+        raise BadPrim(f"faceVertexCounts[{high}]: got {counts[high]}, expected at most {intake.limits.face_corners}")
     if counts.sum() != len(indices):
         raise BadPrim(
-            f"faceVertexIndices: got {len(indices)} values, expected {counts.sum()}, the sum of "
-            f"faceVertexCounts"
+            f"faceVertexIndices: got {len(indices)} values, expected {counts.sum()}, the sum of faceVertexCounts"
         )
     wrong = (indices < 0) | (indices >= len(points))
     if wrong.any():
@@ -232,9 +402,7 @@ def _topology(mesh: UsdGeom.Mesh, intake: Intake) -> tuple[np.ndarray, np.ndarra
         if (used & ~fine).any():
             first = int(np.argmax(used & ~fine))
             value = tuple(points[first].tolist())
-            raise BadPrim(
-                f"points[{first}]: got {value}, expected finite coordinates up to {COORDINATE_MAX:g}"
-            )
+            raise BadPrim(f"points[{first}]: got {value}, expected finite coordinates up to {COORDINATE_MAX:g}")
         points[~fine] = points[indices[0]]  # no face uses it; it must not spoil the bounds
     return points, counts, indices
 
@@ -275,9 +443,7 @@ def _material_subsets(mesh: UsdGeom.Mesh, face_count: int, intake: Intake) -> tu
         family = subset.GetFamilyNameAttr().Get()
         if family != UsdShade.Tokens.materialBind:
             if prim.HasRelationship("material:binding"):
-                intake.note(
-                    prim.GetPath(), f"familyName: got {family!r}; only materialBind subsets carry materials"
-                )
+                intake.note(prim.GetPath(), f"familyName: got {family!r}; only materialBind subsets carry materials")
             continue
         element = subset.GetElementTypeAttr().Get()
         if element != "face":
@@ -311,7 +477,7 @@ def _material_subsets(mesh: UsdGeom.Mesh, face_count: int, intake: Intake) -> tu
 
 def _normals(mesh: UsdGeom.Mesh, intake: Intake) -> tuple[CornerAttribute | None, str]:
     """Authored normals: primvars:normals, else the attribute normals (UsdGeomPointBased's rule)."""
-    primvar = _primvar(mesh.GetPrim(), "normals", 3, intake)
+    primvar = read_primvar(mesh.GetPrim(), "normals", 3, intake)
     if primvar is not None:
         return primvar, "primvars:normals"
     try:
@@ -324,56 +490,6 @@ def _normals(mesh: UsdGeom.Mesh, intake: Intake) -> tuple[CornerAttribute | None
     return CornerAttribute(values, None, str(mesh.GetNormalsInterpolation())), "normals"
 
 
-def _primvar(prim, name: str, width: int, intake: Intake) -> CornerAttribute | None:
-    """A primvar of the prim, or inherited where constant; None (with a note) where it is malformed."""
-    primvar = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(name)
-    if not primvar or not primvar.HasValue():
-        return None
-    label = f"primvars:{name}"
-    try:
-        attribute = primvar.GetAttr()
-        value = attribute.Get(intake.time)
-        if value is None:
-            return None
-        if np.ndim(value) == (1 if width > 1 else 0):
-            # A single value where an array is expected (seen in real files) can only be constant.
-            values = np.array(value, np.float64).reshape(1, width)
-        else:
-            values = floats(attribute, intake.time, width).reshape(-1, width)
-        index = integers(primvar.GetIndicesAttr(), intake.time) if primvar.IsIndexed() else None
-    except (BadPrim, ValueError, TypeError) as fault:
-        intake.bad(prim.GetPath(), f"{label}: {fault}; not used")
-        return None
-    interpolation = str(primvar.GetInterpolation())
-    if interpolation not in ("constant", "uniform", "vertex", "varying", "faceVarying"):
-        intake.bad(
-            prim.GetPath(),
-            f"{label}: got interpolation {interpolation!r}, expected a UsdGeomPrimvar one; not used",
-        )
-        return None
-    if not len(values):
-        return None
-    if index is not None:
-        wrong = (index < 0) | (index >= len(values))
-        if not len(index) or wrong.any():
-            first = int(np.argmax(wrong)) if len(index) else 0
-            got = index[first] if len(index) else "nothing"
-            intake.bad(
-                prim.GetPath(),
-                f"{label}:indices[{first}]: got {got}, expected 0 to {len(values) - 1}; not used",
-            )
-            return None
-    if name == "normals":
-        return CornerAttribute(values, index, interpolation)
-    if not np.isfinite(values).all():
-        first = int(np.argmin(np.isfinite(values).all(axis=1)))
-        intake.bad(
-            prim.GetPath(), f"{label}[{first}]: got {tuple(values[first])}, expected finite numbers; not used"
-        )
-        return None
-    return CornerAttribute(values, index, interpolation)
-
-
 def _unit_normals(values, index, points, triangles, path, intake: Intake) -> tuple[np.ndarray, np.ndarray]:
     """Unit float32 normals; what is zero or not finite becomes the normal of a face that uses it."""
     largest = np.abs(values).max(axis=1)
@@ -383,8 +499,7 @@ def _unit_normals(values, index, points, triangles, path, intake: Intake) -> tup
         first = int(np.argmin(good))
         intake.note(
             path,
-            f"normals[{first}]: got {tuple(values[first].tolist())}; {int(np.sum(~good))} replaced by "
-            f"face normals",
+            f"normals[{first}]: got {tuple(values[first].tolist())}; {int(np.sum(~good))} replaced by face normals",
         )
         a, b, c = (points[triangles[:, k]] for k in range(3))
         facet = np.cross(b - a, c - a)

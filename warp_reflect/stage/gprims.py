@@ -24,9 +24,7 @@ def sphere(radius: float, level: int = 0) -> MeshData:
     """A sphere about the origin: 64 x 32 faces, twice as many each way per level; one quadric patch."""
     segments, bands = SEGMENTS << level, (SEGMENTS // 2) << level
     latitude = np.pi * (np.arange(1, bands) / bands - 0.5)
-    normals = np.concatenate(
-        [[[0.0, 0.0, -1.0]], _rings(np.cos(latitude), np.sin(latitude), segments), [[0, 0, 1.0]]]
-    )
+    normals = np.concatenate([[[0.0, 0.0, -1.0]], _rings(np.cos(latitude), np.sin(latitude), segments), [[0, 0, 1.0]]])
     triangles = [_pole(0, 1, segments, flip=True)]
     triangles += [_band(1 + k * segments, segments) for k in range(bands - 2)]
     triangles.append(_pole(len(normals) - 1, 1 + (bands - 2) * segments, segments))
@@ -44,9 +42,7 @@ def cube(size: float, level: int = 0) -> MeshData:
     for quad in quads:
         a, b, c, d = quad
         normal = points[list(quad)].mean(axis=0) / half
-        pieces.append(
-            (np.array([[a, b, c], [a, c, d]]), normal[None], np.zeros((2, 3), int), _plane(normal, half))
-        )
+        pieces.append((np.array([[a, b, c], [a, c, d]]), normal[None], np.zeros((2, 3), int), _plane(normal, half)))
     return _mesh(points, pieces)
 
 
@@ -95,9 +91,7 @@ def capsule(radius_bottom: float, radius_top: float, height: float, axis: str, l
         latitude = 0.5 * np.pi * np.arange(1, bands) / bands
         first = sum(map(len, points))
         rim = _rings(np.ones(1), np.zeros(1), segments)
-        cap = np.concatenate(
-            [_rings(np.cos(latitude), sign * np.sin(latitude), segments), [[0.0, 0.0, sign]]]
-        )
+        cap = np.concatenate([_rings(np.cos(latitude), sign * np.sin(latitude), segments), [[0.0, 0.0, sign]]])
         points.append(radius * cap + [0.0, 0.0, sign * half])
         # Vertices of the cap counted from its rim: the rim is the side's, the rest its own.
         local = np.arange(bands * segments).reshape(bands, segments)
@@ -256,9 +250,7 @@ def _turn(mesh: MeshData, axis: str) -> MeshData:
     patches = tuple(
         dataclasses.replace(
             patch,
-            shape=dataclasses.replace(
-                patch.shape, unit_from_object=patch.shape.unit_from_object @ z_from_object
-            ),
+            shape=dataclasses.replace(patch.shape, unit_from_object=patch.shape.unit_from_object @ z_from_object),
         )
         for patch in mesh.parts[0].patches
     )

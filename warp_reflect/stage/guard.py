@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 
 @dataclass(frozen=True)
@@ -19,3 +20,14 @@ class Limits:
     """Corners of one face."""
     triangles: int = 200_000_000
     """Triangles of all placed meshes together."""
+    root: str = ""
+    """Folder that layers and pictures must lie in; empty: anywhere."""
+
+
+def confinement_fault(file: str, root: str) -> str:
+    """Why a file may not be read from a stage confined to the folder `root`; empty if it may."""
+    if not root:
+        return ""
+    package = file.partition("[")[0] if file.endswith("]") else file
+    real, inside = Path(package).resolve(), Path(root).resolve()
+    return "" if real.is_relative_to(inside) else f"outside the folder {root}"

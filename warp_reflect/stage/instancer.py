@@ -35,9 +35,7 @@ def read_instancer(prim, intake: Intake) -> tuple[list[str], np.ndarray, np.ndar
     if not targets:
         raise BadPrim("prototypes: got no target, expected at least one")
     if prototype is None or positions is None:
-        raise BadPrim(
-            f"{'positions' if prototype is not None else 'protoIndices'}: got no value, expected an array"
-        )
+        raise BadPrim(f"{'positions' if prototype is not None else 'protoIndices'}: got no value, expected an array")
     count = len(prototype)
     lengths = {"positions": len(positions)}
     for attribute in (
@@ -76,14 +74,11 @@ def read_instancer(prim, intake: Intake) -> tuple[list[str], np.ndarray, np.ndar
         first = int(np.argmax(~finite & shown & known))
         intake.bad(
             prim.GetPath(),
-            f"positions[{first}]: got a transform that is not finite; {int(np.sum(~finite & shown))} "
-            f"instances dropped",
+            f"positions[{first}]: got a transform that is not finite; {int(np.sum(~finite & shown))} instances dropped",
         )
     for k, target in enumerate(targets):
         if (prototype == k).any() and not prim.GetStage().GetPrimAtPath(target):
-            intake.bad(
-                prim.GetPath(), f"prototypes[{k}]: got <{target}>, expected a prim; its instances are dropped"
-            )
+            intake.bad(prim.GetPath(), f"prototypes[{k}]: got <{target}>, expected a prim; its instances are dropped")
             known &= prototype != k
     kept = shown & known & finite
     return targets, prototype[kept], ids[kept], transforms[kept]

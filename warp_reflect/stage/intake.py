@@ -34,12 +34,14 @@ class Intake:
         strict: Whether what would be dropped or repaired with a note is an error instead.
         limits: What is refused for its size.
         notes: What was met so far, each (path, text) once.
+        cache: What readings of one stage at several times share.
     """
 
     time: Usd.TimeCode
     strict: bool = False
     limits: Limits = field(default_factory=Limits)
     notes: list[Note] = field(default_factory=list)
+    cache: dict = field(default_factory=dict)
     _seen: set = field(default_factory=set)
 
     def note(self, path, text: str) -> None:
@@ -70,9 +72,7 @@ def floats(attribute: Usd.Attribute, time: Usd.TimeCode, width: int) -> np.ndarr
     if value is None:
         return None
     array = np.array(value)
-    shape_ok = array.size == 0 or (
-        array.ndim == 1 if width == 1 else array.ndim == 2 and array.shape[1] == width
-    )
+    shape_ok = array.size == 0 or (array.ndim == 1 if width == 1 else array.ndim == 2 and array.shape[1] == width)
     if array.dtype.kind not in "fiu" or not shape_ok:
         kind = "float" if width == 1 else f"float{width}"
         raise BadPrim(f"{attribute.GetName()}: got {type(value).__name__}, expected {kind}[]")
@@ -96,9 +96,7 @@ def integers(attribute: Usd.Attribute, time: Usd.TimeCode) -> np.ndarray | None:
     return array.astype(np.int64)
 
 
-def number(
-    attribute: Usd.Attribute, time: Usd.TimeCode, low: float = -np.inf, open_low: bool = False
-) -> float:
+def number(attribute: Usd.Attribute, time: Usd.TimeCode, low: float = -np.inf, open_low: bool = False) -> float:
     """A finite scalar attribute not below `low` (above it: open_low).
 
     Raises:
@@ -145,8 +143,5 @@ def transform_fault(world_from_object: np.ndarray) -> str:
         return f"transform: got a singular matrix with scales {scale.tolist()}, expected an invertible one"
     volume = abs(np.linalg.det(world_from_object[:3, :3] / scale))
     if volume < SINGULAR_VOLUME:
-        return (
-            f"transform: got a singular matrix (determinant {volume:g} of its axes), expected an "
-            f"invertible one"
-        )
+        return f"transform: got a singular matrix (determinant {volume:g} of its axes), expected an invertible one"
     return ""

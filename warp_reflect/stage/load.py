@@ -15,6 +15,7 @@ def load_stage(
     *,
     complexity: str = "low",
     strict: bool = False,
+    reflectors: tuple[str, ...] = (),
 ) -> Scene:
     """Read a USD stage at one time and put it on a device.
 
@@ -27,6 +28,8 @@ def load_stage(
         purposes: Some of "default", "render", "proxy", "guide"; "default" is always drawn.
         complexity: "low", "medium", "high" or "veryhigh": subdivision and tessellation of gprims.
         strict: Raise for a prim that would be dropped or repaired with a note.
+        reflectors: Patterns of prims, materials or collections that get a mirror's material, whatever the
+            stage says; see `override_reflectors`.
 
     Raises:
         FileNotFoundError: no such file.
@@ -34,7 +37,7 @@ def load_stage(
     """
     from warp_reflect.stage.read import StageReader
 
-    reader = StageReader(path, purposes, complexity, strict)
+    reader = StageReader(path, purposes, complexity, strict, reflectors=reflectors)
 
     def at(code: float | None) -> Scene:
         return Scene(reader.read(code), device, reload=at)

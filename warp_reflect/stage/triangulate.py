@@ -166,20 +166,13 @@ def clip_ears(outline: np.ndarray) -> tuple[np.ndarray, bool]:
             return _first_inside(outline[[a, b, c]], outline, near)
         for k in near.tolist():
             # The two sides of a bridge to a hole touch; they do not cross.
-            if (
-                (x[k], y[k]) not in corners
-                and turn(a, b, k) >= 0.0
-                and turn(b, c, k) >= 0.0
-                and turn(c, a, k) >= 0.0
-            ):
+            if (x[k], y[k]) not in corners and turn(a, b, k) >= 0.0 and turn(b, c, k) >= 0.0 and turn(c, a, k) >= 0.0:
                 return k
         return -1
 
     triangles, clean = [], True
     alive = [True] * size
-    waiting: dict[
-        int, list[int]
-    ] = {}  # reflex corner -> tips whose ear it blocks: tested again only once it goes
+    waiting: dict[int, list[int]] = {}  # reflex corner -> tips whose ear it blocks: tested again only once it goes
     queue, straight = deque(range(size)), deque()
     left, last = size, 0
     while left > 3:
@@ -243,10 +236,7 @@ class _BoxSearch:
     def near(self, a: int, b: int, c: int) -> np.ndarray:
         corners = self.outline[[a, b, c]]
         low, high = corners.min(axis=0).tolist(), corners.max(axis=0).tolist()
-        slabs = [
-            (bisect_left(self.sorted_keys[k], low[k]), bisect_right(self.sorted_keys[k], high[k]))
-            for k in (0, 1)
-        ]
+        slabs = [(bisect_left(self.sorted_keys[k], low[k]), bisect_right(self.sorted_keys[k], high[k])) for k in (0, 1)]
         k = 0 if slabs[0][1] - slabs[0][0] <= slabs[1][1] - slabs[1][0] else 1
         slab = self.orders[k][slice(*slabs[k])]
         other = self.outline[slab, 1 - k]

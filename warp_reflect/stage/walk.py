@@ -1,0 +1,198 @@
+"""The walk over a stage's prims: what is drawn where, with visibility, purpose and instancing resolved."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from pxr import Usd, UsdGeom
+
+from warp_reflect.scene import CameraData, InstanceData, LightData
+from warp_reflect.stage.cameras import read_camera
+from warp_reflect.stage.instancer import expand, read_instancer
+from warp_reflect.stage.intake import BadPrim, Intake, column_matrix
+from warp_reflect.stage.lights import read_light
+
+ANALYTIC = frozenset(("Sphere", "Cube", "Cylinder", "Cylinder_1", "Cone", "Capsule", "Capsule_1", "Plane"))
+
+
+@dataclass(frozen=True)
+class State:
+    """What a prim inherits from the prims above it."""
+
+    world_from_parent: np.ndarray
+    visible: bool = True
+    purpose: str = "default"
+    inside_instancer: bool = False
+
+
+@dataclass
+class Walk:
+    """One pass over a stage at one time.
+
+    Attributes:
+        drawn: The prims that are drawn, each once; what `below` returns has its index here as `mesh`, and no
+            materials yet.
+        lights, cameras: What was met of them.
+    """
+
+    stage: Usd.Stage
+    intake: Intake
+    purposes: frozenset[str]
+    source: str
+    up_axis: str
+    drawn: list = field(default_factory=list)
+    lights: list[LightData] = field(default_factory=list)
+    cameras: list[CameraData] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self._drawn_index: dict[str, int] = {}
+        self.transforms = UsdGeom.XformCache(self.intake.time)
+        self.visited = 0
+        self.prototypes: dict[str, list[InstanceData]] = {}
+        self.open_prototypes: list[str] = []
+        self.elsewhere = self._prototypes_elsewhere()
+
+    def _prototypes_elsewhere(self) -> set[str]:
+        """Paths of prototypes that do not lie below their point instancer: not drawn in place."""
+        paths = set()
+        predicate = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
+        if not any(
+            prim.IsA(UsdGeom.PointInstancer)
+            for root in (self.stage.GetPseudoRoot(), *self.stage.GetPrototypes())
+            for prim in Usd.PrimRange(root)
+        ):
+            return paths
+        for count, prim in enumerate(Usd.PrimRange(self.stage.GetPseudoRoot(), predicate)):
+            if count > self.intake.limits.prims:
+                self._too_many_prims()
+            if prim.IsA(UsdGeom.PointInstancer):
+                targets = UsdGeom.PointInstancer(prim).GetPrototypesRel().GetForwardedTargets()
+                paths.update(str(t) for t in targets if not t.HasPrefix(prim.GetPath()))
+        return paths
+
+    def _too_many_prims(self) -> None:
+        raise ValueError(
+            f"{self.source}: got more than {self.intake.limits.prims} prims, instances included; "
+            "raise the limit if the file is trusted"
+        )
+
+    def below(self, root, state: State, predicate) -> list[InstanceData]:
+        """The instances of the prims below `root`, in namespace order, placed from its parent's frame."""
+        found: list[InstanceData] = []
+        predicate = Usd.TraverseInstanceProxies(predicate)
+        stack = [(child, state) for child in reversed(root.GetFilteredChildren(predicate))]
+        while stack:
+            prim, state = stack.pop()
+            self.visited += 1
+            if self.visited > self.intake.limits.prims:
+                self._too_many_prims()
+            if prim.GetPath().pathElementCount > self.intake.limits.depth:
+                raise ValueError(f"<{prim.GetPath()}>: deeper than {self.intake.limits.depth} levels")
+            if self.elsewhere and str(prim.GetPath()) in self.elsewhere:
+                self.intake.note(prim.GetPath(), "a point instancer's prototype: drawn by the instancer only")
+                continue
+            own = self.visit(prim, state, found)
+            if own is not None:
+                stack.extend((child, own) for child in reversed(prim.GetFilteredChildren(predicate)))
+        return found
+
+    def visit(self, prim, state: State, found: list[InstanceData]) -> State | None:
+        """Take up one prim; returns what its children inherit, None where they are not to be visited."""
+        time = self.intake.time
+        if prim.IsA(UsdGeom.Imageable):
+            imageable = UsdGeom.Imageable(prim)
+            visible = state.visible and imageable.GetVisibilityAttr().Get(time) != UsdGeom.Tokens.invisible
+            purpose_attribute = imageable.GetPurposeAttr()
+            authored = purpose_attribute.HasAuthoredValue()
+            purpose = str(purpose_attribute.Get(time)) if authored else state.purpose
+            local, resets = self.transforms.GetLocalTransformation(prim)
+            world = column_matrix(local)
+            if not resets:
+                world = state.world_from_parent @ world
+            elif state.inside_instancer:
+                self.intake.note(prim.GetPath(), "xformOpOrder: !resetXformStack! stops at the point instancer")
+            state = State(world, visible, purpose, state.inside_instancer)
+        kind = prim.GetTypeName()
+        if prim.IsModel():
+            self._draw_mode(prim)
+        if prim.IsA(UsdGeom.Camera):
+            self._camera(prim, state)
+        elif not state.visible or state.purpose not in self.purposes:
+            pass
+        elif kind == "Mesh" or kind in ANALYTIC:
+            self._geometry(prim, state, found)
+        elif prim.IsA(UsdGeom.PointInstancer):
+            self._instancer(prim, state, found)
+        elif prim.IsA(UsdGeom.Gprim):
+            self.intake.note(prim.GetPath(), f"{kind} is not drawn")
+        elif kind.endswith(("Light", "Light_1")):
+            self._light(prim, state)
+        return None if prim.IsA(UsdGeom.PointInstancer) else state
+
+    def _draw_mode(self, prim) -> None:
+        mode = prim.GetAttribute("model:drawMode")
+        if mode and mode.Get() not in (None, "default", "inherited"):
+            self.intake.note(prim.GetPath(), f"model:drawMode: {mode.Get()} is not used: its geometry is drawn")
+
+    def _camera(self, prim, state: State) -> None:
+        if state.inside_instancer:
+            return
+        try:
+            self.cameras.append(read_camera(prim, state.world_from_parent, self.intake))
+        except BadPrim as fault:
+            self.intake.bad(prim.GetPath(), f"{fault}; camera dropped")
+
+    def _light(self, prim, state: State) -> None:
+        if state.inside_instancer:
+            self.intake.note(prim.GetPath(), f"{prim.GetTypeName()} in a point instancer's prototype is not used")
+            return
+        try:
+            self.lights.append(read_light(prim, state.world_from_parent, self.up_axis, self.intake))
+        except NotImplementedError as unused:
+            self.intake.note(prim.GetPath(), str(unused))
+        except BadPrim as fault:
+            self.intake.bad(prim.GetPath(), f"{fault}; light dropped")
+
+    def _geometry(self, prim, state: State, found: list[InstanceData]) -> None:
+        path = str(prim.GetPath())
+        if path not in self._drawn_index:
+            self._drawn_index[path] = len(self.drawn)
+            self.drawn.append(prim)
+        found.append(InstanceData(self._drawn_index[path], state.world_from_parent, path, ()))
+
+    def _instancer(self, prim, state: State, found: list[InstanceData]) -> None:
+        path = str(prim.GetPath())
+        try:
+            targets, prototype, ids, transforms = read_instancer(prim, self.intake)
+        except BadPrim as fault:
+            self.intake.bad(path, f"{fault}; instancer dropped")
+            return
+        for k, target in enumerate(targets):
+            chosen = np.flatnonzero(prototype == k)
+            if not len(chosen):
+                continue
+            items = self._prototype(prim, target, state.purpose)
+            if len(items) * len(chosen) + len(found) > self.intake.limits.instances:
+                raise ValueError(f"<{path}>: more than {self.intake.limits.instances} instances; raise the limit")
+            worlds = state.world_from_parent @ transforms[chosen]
+            found.extend(expand(items, worlds, ids[chosen], path))
+
+    def _prototype(self, instancer, target: str, purpose: str) -> list[InstanceData]:
+        """The instances of one prototype of a point instancer, placed from the prototype's parent frame."""
+        key = f"{target} {purpose}"
+        if target in self.open_prototypes:
+            self.intake.bad(instancer.GetPath(), f"prototypes: <{target}> holds this instancer itself; not drawn")
+            return []
+        if key not in self.prototypes:
+            self.open_prototypes.append(target)
+            prim = self.stage.GetPrimAtPath(target)
+            # Prototypes are often kept as overs or classes so that nothing draws them in place.
+            predicate = Usd.PrimIsActive & Usd.PrimIsLoaded
+            found: list[InstanceData] = []
+            state = self.visit(prim, State(np.eye(4), purpose=purpose, inside_instancer=True), found)
+            if state is not None:
+                found.extend(self.below(prim, state, predicate))
+            self.prototypes[key] = found
+            self.open_prototypes.pop()
+        return self.prototypes[key]
