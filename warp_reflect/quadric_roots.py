@@ -38,11 +38,10 @@ TOUCH_SHARE = wp.float64(0.1)  # of the values beside a dip; one that touches ze
 GOLDEN = wp.float64(0.6180339887498949)
 T_SLACK = wp.float64(1.0e-3)  # starts this far outside the segment may still end on a root within
 POLISH_STEPS = wp.constant(40)
+ON_SURFACE = wp.float64(1.0e-7)  # of the size: corrections below it leave less than rounding
 SAME_ROOT = wp.float64(1.0e-7)  # of the size: closer points are one root found twice
 SPLIT = wp.float64(1.0e-6)  # of the size: how far a symmetric configuration is moved before the scan
-NULL_DIRECTION = wp.float64(
-    1.0e-8
-)  # eigenvalues of the Hessian below this share are no direction to step along
+NULL_DIRECTION = wp.float64(1.0e-8)  # eigenvalues of the Hessian below this share are no direction to step along
 
 FLAG_RING = wp.constant(16)  # a whole ring (or sphere) of roots
 
@@ -57,9 +56,7 @@ class PolishedRoot:
     point: wp.vec3d
     length: wp.float64
     index: int  # Morse index: negative eigenvalues of the path length's Hessian
-    flat: (
-        wp.float64
-    )  # smallest eigenvalue over the size of its terms and the cosine; 0 on a caustic or a ring
+    flat: wp.float64  # smallest eigenvalue over the size of its terms and the cosine; 0 on a caustic or a ring
     valid: int
 
 
@@ -130,16 +127,20 @@ def polish_root(start: wp.vec3d, o: wp.vec3d, v: wp.vec3d, a: wp.vec3d, b: wp.fl
     half = wp.float64(0.5)
     root = PolishedRoot()
     p = start
-    for _k in range(4):
-        n = quadric_half_gradient(p, a, b)
-        nn = wp.dot(n, n)
-        if nn > zero:
-            p = p - (half * quadric_value(p, a, b, c) / nn) * n
     error = wp.float64(4.0)
+    settled = bool(False)
     noise = zero
     c_o = zero
     c_v = zero
     for _k in range(POLISH_STEPS):
+        n = quadric_half_gradient(p, a, b)
+        nn = wp.dot(n, n)
+        if not (nn > zero):
+            return root
+        # What is left of the distance to the surface after this correction is its square.
+        lift = half * quadric_value(p, a, b, c) / nn
+        p = p - lift * n
+        height = wp.abs(lift) * wp.sqrt(nn)
         n = quadric_half_gradient(p, a, b)
         n_length = wp.length(n)
         to_o = o - p
@@ -213,7 +214,8 @@ def polish_root(start: wp.vec3d, o: wp.vec3d, v: wp.vec3d, a: wp.vec3d, b: wp.fl
         root.point = p
         root.length = l_o + l_v
         long = wp.sqrt(d1 * d1 + d2 * d2)
-        if error <= noise or long <= wp.float64(4.0e-16) * (one + wp.length(p)):
+        settled = height <= ON_SURFACE * (one + wp.length(p))
+        if settled and (error <= noise or long <= wp.float64(4.0e-16) * (one + wp.length(p))):
             break
         reach = wp.min(wp.float64(0.3) * (one + wp.length(p)), wp.max(l_o, l_v))
         if long > reach:
@@ -230,12 +232,7 @@ def polish_root(start: wp.vec3d, o: wp.vec3d, v: wp.vec3d, a: wp.vec3d, b: wp.fl
             p = moved - (q / (slope + wp.sqrt(disc))) * n
         else:
             p = p + half * step
-        for _j in range(2):
-            m = quadric_half_gradient(p, a, b)
-            mm = wp.dot(m, m)
-            if mm > zero:
-                p = p - (half * quadric_value(p, a, b, c) / mm) * m
-    if error <= wp.float64(1.0e4) * noise and c_o > zero and c_v > zero:
+    if settled and error <= wp.float64(1.0e4) * noise and c_o > zero and c_v > zero:
         root.valid = int(1)
     return root
 
@@ -500,9 +497,7 @@ def off_symmetry(o: wp.vec3d, v: wp.vec3d, a: wp.vec3d, equal: int):
 
 
 @wp.func
-def all_reflections(
-    eye: wp.vec3d, target: wp.vec3d, a: wp.vec3d, b: wp.float64, c: wp.float64, equal: int, sheet: int
-):
+def all_reflections(eye: wp.vec3d, target: wp.vec3d, a: wp.vec3d, b: wp.float64, c: wp.float64, equal: int, sheet: int):
     """Every reflection point on the side where q > 0.
 
     Args:

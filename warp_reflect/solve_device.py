@@ -275,8 +275,10 @@ def judge(
     found.residual = specular_residual(r, n, eye, target)
     bend = (wp.abs(lam[0]) + wp.abs(lam[1]) + wp.abs(lam[2]) - wp.abs(quadric_curve(n, n, lam))) / n_length
     scale = one + wp.length(r)
-    slack = wp.float64(SLACK) * roundoff * (one + scale * (bend + one / l_eye + one / l_target))
     cosine = wp.dot(to_eye, n) / l_eye
+    # The half vector shrinks with the cosine, the rounding of its two parts does not.
+    slack = wp.float64(SLACK) * roundoff * (one + scale * (bend + one / l_eye + one / l_target))
+    slack = slack / wp.max(cosine, grazing)
     found.status = CONVERGED
     if cosine < grazing:
         found.status = GRAZING
@@ -456,9 +458,7 @@ def solve_convex_kernel(
                 best = other
                 other = swap
             if out_roots.shape[1] > 1:
-                write_root(
-                    zero, other, 1, 0, view, row, out_roots, out_root_length, out_root_index, out_root_status
-                )
+                write_root(zero, other, 1, 0, view, row, out_roots, out_root_length, out_root_index, out_root_status)
                 out_root_count[row] = 1
         elif has_point(other.status):
             best = other
@@ -468,9 +468,7 @@ def solve_convex_kernel(
     if has_point(best.status):
         write_answer(zero, best, view, row, out_point, out_normal, out_virtual, out_residual)
         if out_roots.shape[1] > 0:
-            write_root(
-                zero, best, 0, 0, view, row, out_roots, out_root_length, out_root_index, out_root_status
-            )
+            write_root(zero, best, 0, 0, view, row, out_roots, out_root_length, out_root_index, out_root_status)
             out_root_count[row] = out_root_count[row] + 1
 
 
@@ -570,15 +568,11 @@ def solve_general_kernel(
         if best.status == CONVERGED:
             best_rank = 0
             if out_roots.shape[1] > 0:
-                write_root(
-                    zero, best, 0, 0, view, row, out_roots, out_root_length, out_root_index, out_root_status
-                )
+                write_root(zero, best, 0, 0, view, row, out_roots, out_root_length, out_root_index, out_root_status)
             count = 1
         else:
             best = Found()
-    found, root_count = all_reflections(
-        cut_far(eye, far), cut_far(target, far), a, b, c, view.equal, view.sheet
-    )
+    found, root_count = all_reflections(cut_far(eye, far), cut_far(target, far), a, b, c, view.equal, view.sheet)
     for k in range(root_count):
         code = int(found[k, 4])
         ring = code & FLAG_RING
