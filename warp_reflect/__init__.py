@@ -12,19 +12,19 @@ _HOME = {
     "Camera": "layers",
     "Frame": "frame",
     "Plan": "planner",
-    "PlanarMirror": "solve",
-    "QuadricMirror": "solve",
+    "PlanarMirror": "mirrors",
+    "QuadricMirror": "mirrors",
     "ReflectorMap": "reflector_maps",
     "Scene": "scene",
     "Settings": "settings",
-    "Solution": "solve",
+    "Solution": "solver",
     "Status": "settings",
     "Technique": "settings",
     "compare_frames": "metrics",
     "load_stage": "stage.load",
     "make_plan": "planner",
     "render_frame": "frame",
-    "solve": "solve",
+    "solve": "solver",
 }
 __all__ = ["__version__", *sorted(_HOME)]
 

@@ -31,6 +31,7 @@ class ReflectorMapView:
     inv_extent: wp.vec3
     inner_radius: float  # the whitened body contains the ball of this radius
     outer_radius: float  # and lies in the ball of this one
+    least_curvature: float  # of an ellipsoid with these extents [1/unit]
 
 
 @wp.struct
@@ -184,6 +185,7 @@ class ReflectorMap:
         view.inv_extent = wp.vec3(*(1.0 / extent))
         view.inner_radius = inner
         view.outer_radius = outer
+        view.least_curvature = float(extent.min() / extent.max() ** 2)
         return cls(texels, unit_from_body, extent, inner, outer, view)
 
 

@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 import warp as wp
 
-from warp_reflect.bodies import Body, analyse
+from warp_reflect.bodies import Body, analyse, weld
 
 wp.set_module_options({"enable_backward": False})
 
@@ -296,9 +296,33 @@ class Scene:
         return self._reload(time)
 
     @cached_property
+    def _host_neighbours(self) -> np.ndarray:
+        # Welded: the seams of gprims and of faceVarying exports must not stop a walk.
+        return edge_neighbours(weld(self.host_points, self.host_triangles))
+
+    @cached_property
     def neighbours(self) -> wp.array:
         """Per triangle the triangle across each edge (v0v1, v1v2, v2v0), -1 where there is none. vec3i [triangle_count]"""
-        return wp.array(edge_neighbours(self.host_triangles), dtype=wp.vec3i, device=self.device)
+        return wp.array(self._host_neighbours, dtype=wp.vec3i, device=self.device)
+
+    @cached_property
+    def closed_patches(self) -> wp.array:
+        """1 per patch of a part that is closed and wound outwards: no ray from outside meets its back first. int32"""
+        across = self._host_neighbours
+        closed = np.zeros(max(len(self.patch_shapes), 1), np.int32)
+        corner = self.host_points[self.host_triangles].astype(np.float64)
+        volume = np.einsum("ij,ij->i", corner[:, 0], np.cross(corner[:, 1], corner[:, 2]))
+        for part in self.parts:
+            own = slice(part.first_triangle, part.first_triangle + part.triangle_count)
+            beyond = across[own]
+            inside = (beyond >= own.start) & (beyond < own.stop)
+            middle = corner[own].reshape(-1, 3).mean(axis=0) if part.triangle_count else np.zeros(3)
+            area = np.cross(corner[own][:, 1] - corner[own][:, 0], corner[own][:, 2] - corner[own][:, 0])
+            # The volume about the part's own middle: about a far origin it would cancel.
+            outward = volume[own].sum() - float(area.sum(axis=0) @ middle) > 0.0
+            if part.triangle_count and inside.all() and outward:
+                closed[list(part.patches)] = 1
+        return wp.array(closed, dtype=int, device=self.device)
 
     @cached_property
     def tracer(self):

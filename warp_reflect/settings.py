@@ -77,6 +77,8 @@ class Settings:
     """Interpolation grid: solved nodes as a fraction of the vertices; 0: every vertex is searched."""
     grid_kind: str = "direction"
     """What the grid holds: `direction` (one exact step a vertex) or `position` (the paper's virtual positions)."""
+    edge_px: float = 0.5
+    """Virtual triangles are cut until a straight edge's picture bends by less than this; 0: never cut. [pixels]"""
     refine: str = "exact"
     """`exact` (every pixel gets the hit of an exact ray-triangle test) or `off` (the papers' picture)."""
     walk_hops: int = 4
@@ -96,6 +98,7 @@ class Settings:
         _require(self.search in SEARCHES, "search", self.search, f"one of {', '.join(SEARCHES)}")
         _require(0.0 <= self.grid_share <= 1.0, "grid_share", self.grid_share, "0 to 1")
         _require(self.grid_kind in GRID_KINDS, "grid_kind", self.grid_kind, f"one of {', '.join(GRID_KINDS)}")
+        _require(0.0 <= self.edge_px <= 1.0e6, "edge_px", self.edge_px, "0 (never cut) or a number of pixels")
         _require(self.refine in REFINEMENTS, "refine", self.refine, f"one of {', '.join(REFINEMENTS)}")
         _require(self.complexity in COMPLEXITIES, "complexity", self.complexity, f"one of {', '.join(COMPLEXITIES)}")
         _require(0 <= self.iterations <= 1000, "iterations", self.iterations, "0 to 1000")

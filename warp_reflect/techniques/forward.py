@@ -28,7 +28,8 @@ from warp_reflect.optics import virtual_point
 from warp_reflect.scene import PartRange, Scene, SceneView
 from warp_reflect.settings import Settings, Status
 from warp_reflect.shapes import clamp_weights, intersect_triangle
-from warp_reflect.techniques import refine
+from warp_reflect.techniques import refine, virtual_mesh
+from warp_reflect.techniques.virtual_mesh import VirtualMesh
 from warp_reflect.timing import StageTimer
 
 wp.set_module_options({"enable_backward": False})
@@ -37,6 +38,10 @@ CONVERGED = wp.constant(int(Status.CONVERGED))
 HIDDEN = wp.constant(int(Status.HIDDEN))
 MAX_ITERATIONS = wp.constant(int(Status.MAX_ITERATIONS))
 SKY = wp.constant(int(Status.SKY))
+ESTIMATE = wp.constant(8.0 / 1.5)
+# Of the path length: surfaces in contact that differ by less are told apart by refinement's tests of neighbours.
+DEPTH_BEND = 2.0e-4
+DEPTH_REACH = wp.constant(float(np.sqrt(8.0 * DEPTH_BEND)))
 BOUNDARY_STEPS = 12  # bisections of an edge at the hidden boundary: 1/4096 of its length, below a pixel
 
 
@@ -58,13 +63,16 @@ class VertexView:
     status: wp.array(dtype=wp.uint8)
     seed: wp.array(dtype=wp.vec3)  # what a warm start begins from; zero: nothing known
     residual: wp.array(dtype=float)
+    # Longest edges that stay whole, unit frame: for one radian of bending of the picture, and for its depth; 0: any.
+    reach: wp.array(dtype=wp.vec2)
     position: wp.array(dtype=wp.vec3)  # eye-frame virtual vertex; length 0 where nobody reads it
 
 
 @dataclass
 class History:
-    """What the next frame's search of a reflector may start from."""
+    """What the next frame of a reflector may start from: the mesh it reflected, and the seeds of its vertices."""
 
+    mesh: VirtualMesh
     seed: wp.array
 
 
@@ -74,6 +82,31 @@ def virtual_vertex(frame: SolveFrame, p: wp.vec3, n: wp.vec3, target: wp.vec3) -
     # Curvature of a body of the map's size: it only picks the form that forgives an error of p more.
     curvature = 1.0 / wp.max(wp.length(p), 1.0e-6)
     return frame.eye_from_unit * (virtual_point(p, n, frame.eye, target, curvature) - frame.eye)
+
+
+@wp.func
+def edge_reach(frame: SolveFrame, p: wp.vec3, n: wp.vec3, target: wp.vec3, curvature: float) -> float:
+    """Length of a scene edge at `target` whose virtual picture deviates from a straight one by one radian.
+
+    The deviation grows with the square of the length: (h^2 / 8) 1.5 / (d_O d_V^2 lambda), lambda the least eigenvalue of
+    the path length's Hessian with the body's least curvature. Estimate of the interpolation error of virtual positions.
+    """
+    to_eye = frame.eye - p
+    d_o = wp.length(to_eye)
+    d_v = wp.length(target - p)
+    c = wp.abs(wp.dot(n, to_eye)) / wp.max(d_o, 1.0e-20)
+    least = c * c * (1.0 / wp.max(d_o, 1.0e-20) + 1.0 / wp.max(d_v, 1.0e-20)) + 2.0 * c * curvature
+    return d_v * wp.sqrt(ESTIMATE * d_o * least)
+
+
+@wp.func
+def depth_reach(frame: SolveFrame, p: wp.vec3, target: wp.vec3) -> float:
+    """Length of a scene edge whose straight virtual picture is wrong in depth by less than DEPTH_BEND of the path.
+
+    Path length along a straight edge bends like a distance does, by h^2 / 8 over itself; minified, its virtual edge
+    hardly does.
+    """
+    return DEPTH_REACH * (wp.length(p - frame.eye) + wp.length(target - p))
 
 
 @wp.kernel
@@ -114,6 +147,20 @@ def project_points_kernel(
     out_screen[i] = project(camera, points[i])
 
 
+@wp.func
+def triangle_weights(p: wp.vec3, e1: wp.vec3, e2: wp.vec3) -> wp.vec2:
+    """Weights of the second and third corner of a point in a triangle's plane, all relative to the first."""
+    g11 = wp.dot(e1, e1)
+    g12 = wp.dot(e1, e2)
+    g22 = wp.dot(e2, e2)
+    det = g11 * g22 - g12 * g12
+    if det <= 0.0:
+        return wp.vec2(0.0, 0.0)
+    d1 = wp.dot(p, e1)
+    d2 = wp.dot(p, e2)
+    return clamp_weights((g22 * d1 - g12 * d2) / det, (g11 * d2 - g12 * d1) / det)
+
+
 @wp.kernel
 def candidate_hits_kernel(
     first: int,
@@ -125,6 +172,10 @@ def candidate_hits_kernel(
     pixel: wp.array(dtype=int),
     point: wp.array(dtype=wp.vec3),
     direction: wp.array(dtype=wp.vec3),
+    # Virtual mesh:
+    points: wp.array(dtype=wp.vec3),
+    triangles: wp.array(dtype=wp.vec3i),
+    parents: wp.array(dtype=int),
     # Outputs:
     out_triangle: wp.array(dtype=int),
     out_u: wp.array(dtype=float),
@@ -137,14 +188,14 @@ def candidate_hits_kernel(
     x = pixel[i] % camera.width
     y = pixel[i] / camera.width
     cell = (y - target.y0) * (target.x1 - target.x0) + x - target.x0
-    triangle = raster.key_triangle(target.key[cell])
-    if triangle < 0:
+    drawn = raster.key_triangle(target.key[cell])
+    if drawn < 0:
         out_status[i] = wp.uint8(SKY)
         return
-    t = scene.triangles[triangle]
-    v0 = scene.points[t[0]]
-    v1 = scene.points[t[1]]
-    v2 = scene.points[t[2]]
+    t = triangles[drawn]
+    v0 = points[t[0]]
+    v1 = points[t[1]]
+    v2 = points[t[2]]
     a = screen[t[0]]
     b = screen[t[1]]
     c = screen[t[2]]
@@ -164,9 +215,13 @@ def candidate_hits_kernel(
         hit = intersect_triangle(point[i], direction[i], v0, v1, v2)
         weights = clamp_weights(hit.u, hit.v)
     position = v0 + weights[0] * (v1 - v0) + weights[1] * (v2 - v0)
+    triangle = parents[drawn]
+    owner = scene.triangles[triangle]
+    p0 = scene.points[owner[0]]
+    inside = triangle_weights(position - p0, scene.points[owner[1]] - p0, scene.points[owner[2]] - p0)
     out_triangle[i] = triangle
-    out_u[i] = weights[0]
-    out_v[i] = weights[1]
+    out_u[i] = inside[0]
+    out_v[i] = inside[1]
     out_distance[i] = wp.length(position - point[i])
     out_status[i] = wp.uint8(CONVERGED)
 
@@ -205,8 +260,9 @@ def reflect(
 
     Args:
         unit_from_scene: float64 [4, 4] similarity into the solver's frame.
-        solve_vertices: (frame, warm, out VertexView) -> None, fills one entry per scene vertex.
-        solve_boundary: (frame, edges vec2i, out points vec3) -> None, see `reflector_map.boundary_kernel`.
+        solve_vertices: (points, own_count, frame, warm, out VertexView) -> None, fills one entry per point; the first
+            `own_count` are the mirror's own or the scene's, see `own_vertices`.
+        solve_boundary: (points, frame, edges vec2i, out points vec3) -> None, see `reflector_map.boundary_kernel`.
         history: The same reflector's layer history of the previous frame.
 
     Returns:
@@ -217,15 +273,22 @@ def reflect(
         return layer
     timer = StageTimer(scene.device)
     part = scene.parts[reflector.part]
+    frame = solve_frame(scene, camera, unit_from_scene)
     with timer("search"):
-        vertices, warm = _vertices(scene, history)
-        frame = solve_frame(scene, camera, unit_from_scene)
-        solve_vertices(frame, warm, vertices)
-        layer.history = History(vertices.seed)
+        mesh = history.mesh if history else virtual_mesh.whole(scene, part)
+        vertices = empty_vertices(mesh.vertex_count, scene.device)
+        if history:
+            wp.copy(vertices.seed, history.seed)  # the previous frame keeps its own answer
+        solve_vertices(mesh.points, True, frame, history is not None, vertices)
+    with timer("tessellate"):
+        mesh, vertices = _cut_where_bent(
+            scene, part, mesh, vertices, frame, solve_vertices, unit_from_scene, camera, pixels, settings
+        )
+        layer.history = History(mesh, vertices.seed)
     with timer("virtual_raster"):
         target = raster.make_target(gbuffer.view, pixels.box, scene.device, gbuffer.reflector_id, reflector.id)
-        drawn = _draw_others(scene, part, target, vertices, settings.threads)
-        clipped, failed = _draw_straddling(scene, part, target, frame, vertices, solve_boundary, gbuffer, settings)
+        drawn = raster.rasterise(target, vertices.screen, mesh.triangles, threads=settings.threads)
+        clipped, failed = _draw_straddling(scene, mesh, target, frame, vertices, solve_boundary, gbuffer, settings)
     if settings.refine == "off":
         with timer("candidates"):
             launch(
@@ -233,6 +296,7 @@ def reflect(
                 pixels.count,
                 [scene.view, gbuffer.view, target.view, vertices.screen]
                 + [pixels.pixel, pixels.point, pixels.direction]
+                + [mesh.points, mesh.triangles, mesh.parents]
                 + [layer.triangle, layer.u, layer.v, layer.distance, layer.status],
                 scene.device,
                 settings.threads,
@@ -240,12 +304,14 @@ def reflect(
         layer.statistics.update(candidate=pixels.count)
     else:
         with timer("refine"):
-            doubtful = refine.settle(scene, gbuffer, pixels, target, layer, settings, trust_sky=failed == 0)
+            doubtful = refine.settle(
+                scene, gbuffer, pixels, target, mesh.parents, layer, settings, trust_sky=failed == 0
+            )
         with timer("trace"):
             bvh.trace_pixels(
                 scene, gbuffer, pixels, layer, reflector.part, reflector.convex, doubtful, settings.threads
             )
-    layer.statistics.update(vertices=scene.vertex_count, drawn=drawn, clipped=clipped, failed=failed, warm=warm)
+    layer.statistics.update(vertices=mesh.vertex_count, drawn=drawn, clipped=clipped, failed=failed)
     layer.timings = timer.ms
     return layer
 
@@ -256,55 +322,60 @@ def empty_vertices(count: int, device, with_position: bool = False) -> VertexVie
     vertices.screen = wp.full(count, wp.vec4(0.0, 0.0, raster.DROPPED, 0.0), dtype=wp.vec4, device=device)
     vertices.status = wp.zeros(count, dtype=wp.uint8, device=device)
     vertices.residual = wp.zeros(count, dtype=float, device=device)
+    vertices.reach = wp.zeros(count, dtype=wp.vec2, device=device)
     vertices.seed = wp.zeros(count, dtype=wp.vec3, device=device)
     vertices.position = wp.zeros(count if with_position else 0, dtype=wp.vec3, device=device)
     return vertices
 
 
-def _vertices(scene: Scene, history: History | None) -> tuple[VertexView, bool]:
-    """Fresh per-vertex results; seeds of the previous frame where they are of the same scene."""
-    vertices = empty_vertices(scene.vertex_count, scene.device)
-    warm = history is not None and len(history.seed) == scene.vertex_count and history.seed.device == scene.device
-    if warm:
-        # Copied: the previous frame keeps its own answer.
-        vertices.seed = wp.clone(history.seed)
-    return vertices, warm
+VERTEX_ARRAYS = ("screen", "status", "residual", "reach", "seed")
 
 
-def _other_triangles(scene: Scene, part) -> list[tuple[int, wp.array]]:
-    """(first triangle, triangles) of the ranges before and after the mirror's own."""
-    end = part.first_triangle + part.triangle_count
-    ranges = [(0, part.first_triangle), (end, scene.triangle_count)]
-    return [(low, scene.view.triangles[low:high]) for low, high in ranges if high > low]
+def _cut_where_bent(
+    scene, part, mesh, vertices, frame, solve_vertices, unit_from_scene, camera, pixels, settings
+) -> tuple[VirtualMesh, VertexView]:
+    """Cut triangles whose picture would bend by more than `edge_px`; keep the mesh where it is fine enough."""
+    if settings.edge_px == 0.0:
+        return mesh, vertices
+    unit_per_scene = float(np.cbrt(abs(np.linalg.det(unit_from_scene[:3, :3]))))
+    tolerance = settings.edge_px / max(camera.fx, camera.fy)
+
+    def cuts_for(multiple: float) -> np.ndarray:
+        cuts = virtual_mesh.needed_cuts(
+            scene, vertices, unit_per_scene, tolerance, multiple, pixels.box, settings.threads
+        )
+        cuts[part.first_triangle : part.first_triangle + part.triangle_count] = 1
+        return cuts
+
+    if (cuts_for(mesh.relaxed) <= mesh.cuts).all():
+        return mesh, vertices
+    cuts, relaxed = virtual_mesh.within_budget(lambda m: cuts_for(m / virtual_mesh.CUT_SLACK), scene)
+    finer = virtual_mesh.cut_mesh(scene, part, np.maximum(cuts, 1), relaxed)
+    known = empty_vertices(finer.vertex_count, scene.device)
+    base = mesh.base_count
+    added = VertexView()
+    for name in VERTEX_ARRAYS:
+        wp.copy(getattr(known, name), getattr(vertices, name), count=base)
+        setattr(added, name, getattr(known, name)[base:])
+    added.position = wp.zeros(0, dtype=wp.vec3, device=scene.device)
+    solve_vertices(finer.points[base:], False, frame, False, added)
+    return finer, known
 
 
-def _draw_others(scene, part, target, vertices, threads) -> int:
-    drawn = 0
-    for offset, triangles in _other_triangles(scene, part):
-        drawn += raster.rasterise(target, vertices.screen, triangles, id_offset=offset, threads=threads)
-    return drawn
-
-
-def _draw_straddling(scene, part, target, frame, vertices, solve_boundary, gbuffer, settings) -> tuple[int, int]:
+def _draw_straddling(scene, mesh, target, frame, vertices, solve_boundary, gbuffer, settings) -> tuple[int, int]:
     """Draw the visible side of triangles that straddle the hidden boundary; (drawn, triangles with a failed corner).
 
     On the boundary the line of sight grazes the mirror, so the virtual point is the real one.
     """
-    kind = wp.zeros(scene.triangle_count, dtype=wp.uint8, device=scene.device)
-    launch(
-        straddle_kernel,
-        scene.triangle_count,
-        [scene.view.triangles, vertices.status, kind],
-        scene.device,
-        settings.threads,
-    )
+    count = len(mesh.triangles)
+    kind = wp.zeros(count, dtype=wp.uint8, device=scene.device)
+    launch(straddle_kernel, count, [mesh.triangles, vertices.status, kind], scene.device, settings.threads)
     host_kind = kind.numpy()
     failed = int((host_kind == 2).sum())
     ids = np.flatnonzero(host_kind == 1)
-    ids = ids[(ids < part.first_triangle) | (ids >= part.first_triangle + part.triangle_count)]
     if not len(ids):
         return 0, failed
-    corner = scene.host_triangles[ids]
+    corner = mesh.host_triangles[ids]
     visible = vertices.status.numpy()[corner] == int(Status.CONVERGED)
     # Turn each triangle so that the corner unlike the other two comes first.
     single = visible.sum(axis=1) == 1
@@ -318,7 +389,7 @@ def _draw_straddling(scene, part, target, frame, vertices, solve_boundary, gbuff
         ]
     ).astype(np.int32)
     points = wp.empty(len(edges), dtype=wp.vec3, device=scene.device)
-    solve_boundary(frame, wp.array(edges, dtype=wp.vec2i, device=scene.device), points)
+    solve_boundary(mesh.points, frame, wp.array(edges, dtype=wp.vec2i, device=scene.device), points)
     boundary = wp.empty(len(edges), dtype=wp.vec4, device=scene.device)
     launch(project_points_kernel, len(edges), [points, gbuffer.view, boundary], scene.device, settings.threads)
     known = vertices.screen.numpy()
@@ -326,8 +397,7 @@ def _draw_straddling(scene, part, target, frame, vertices, solve_boundary, gbuff
     cut = boundary.numpy()
     # One visible corner: (a, cut ab, cut ac). Two: the quadrilateral b, c, cut ca, cut ba as two triangles.
     screen = np.concatenate([known[a], known[b], known[c], cut[:n], cut[n:]]).astype(np.float32)
-    row = np.arange(n)
-    va, vb, vc, vab, vac = (row + k * n for k in range(5))
+    va, vb, vc, vab, vac = (np.arange(n) + k * n for k in range(5))
     ones = np.stack([va, vab, vac], 1)[single]
     twos = np.concatenate([np.stack([vb, vc, vac], 1)[~single], np.stack([vb, vac, vab], 1)[~single]])
     triangles = np.concatenate([ones, twos]).astype(np.int32)

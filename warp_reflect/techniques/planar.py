@@ -118,12 +118,13 @@ def reflect(
     """Mirror every vertex, draw, refine: see `forward.reflect`."""
     part = scene.parts[prepared.reflector.part]
 
-    def solve_vertices(frame: SolveFrame, warm: bool, out_vertex: VertexView) -> None:
-        inputs = [scene.view.points, *forward.own_vertices(part), frame, gbuffer.view, out_vertex]
-        launch(mirror_kernel, scene.vertex_count, inputs, scene.device, settings.threads)
+    def solve_vertices(points, has_own: bool, frame: SolveFrame, warm: bool, out_vertex: VertexView) -> None:
+        own = forward.own_vertices(part) if has_own else [0, 0]
+        inputs = [points, *own, frame, gbuffer.view, out_vertex]
+        launch(mirror_kernel, len(points), inputs, scene.device, settings.threads)
 
-    def solve_boundary(frame: SolveFrame, edges: wp.array, out_point: wp.array) -> None:
-        inputs = [scene.view.points, frame, edges, out_point]
+    def solve_boundary(points, frame: SolveFrame, edges: wp.array, out_point: wp.array) -> None:
+        inputs = [points, frame, edges, out_point]
         launch(plane_crossing_kernel, len(edges), inputs, scene.device, settings.threads)
 
     return forward.reflect(

@@ -32,6 +32,8 @@ EMPTY = wp.constant(3)
 # Of the depth key. A surface seen in a mirror is smooth on the screen: its key's second difference stays below this;
 # what exceeds it is the edge of a nearer object.
 DEPTH_STEP = wp.constant(0.01)
+# Of the depth key: a smaller rise may be a step of the same mesh (a tile over its joint); the neighbour's triangle is tested.
+FINE_STEP = wp.constant(2.0e-4)
 # Candidates of another patch at nearly the same depth (a plate on a table) are tested too and the nearer hit is taken.
 NEARER_SHARE = wp.constant(0.98)
 
@@ -43,6 +45,7 @@ class WalkHit:
     v: float
     t: float
     hops: int
+    from_behind: int  # 1: the ray leaves through the hit triangle's back
     turned: int  # 1: the hit triangle faces the ray unlike the first one
 
 
@@ -77,6 +80,8 @@ def walk(
                 result.v = weights[1]
                 result.t = hit.t
                 result.hops = hops
+                if hit.det > 0.0:
+                    result.from_behind = 1
                 if facing * hit.det < 0.0:
                     result.turned = 1
             return result
@@ -117,7 +122,9 @@ def settle_kernel(
     first: int,
     scene: SceneView,
     neighbours: wp.array(dtype=wp.vec3i),
+    closed: wp.array(dtype=int),
     target: raster.TargetView,
+    parents: wp.array(dtype=int),
     # Mirror pixels:
     pixel: wp.array(dtype=int),
     point: wp.array(dtype=wp.vec3),
@@ -139,8 +146,8 @@ def settle_kernel(
     x = pixel[i] % target.mask_width
     y = pixel[i] / target.mask_width
     key = cell_key(target, x, y)
-    candidate = raster.key_triangle(key)
-    if candidate < 0:
+    drawn = raster.key_triangle(key)
+    if drawn < 0:
         if trust_sky == 0:
             return
         for dy in range(-1, 2):
@@ -151,8 +158,11 @@ def settle_kernel(
         out_status[i] = wp.uint8(SKY)
         out_settled[i] = wp.uint8(EMPTY)
         return
+    candidate = parents[drawn]
     hit = walk(scene, neighbours, point[i], direction[i], candidate, hop_count)
     if hit.triangle < 0 or hit.turned != 0:
+        return
+    if hit.from_behind != 0 and closed[scene.triangle_patch[hit.triangle]] != 0:
         return
     depth = raster.key_depth(key)
     patch = scene.triangle_patch[candidate]
@@ -162,7 +172,10 @@ def settle_kernel(
                 continue
             near_key = cell_key(target, x + dx, y + dy)
             other = raster.key_triangle(near_key)
-            if other < 0 or other == candidate:
+            if other < 0 or other == drawn:
+                continue
+            other = parents[other]
+            if other == candidate:
                 continue
             near_depth = raster.key_depth(near_key)
             opposite = raster.key_depth(cell_key(target, x - dx, y - dy))
@@ -172,7 +185,8 @@ def settle_kernel(
                 bend = near_depth - depth - wp.max(depth - opposite, 0.0)
             if bend > DEPTH_STEP * depth:
                 return
-            if scene.triangle_patch[other] != patch and near_depth > NEARER_SHARE * depth:
+            separate = scene.triangle_patch[other] != patch and near_depth > NEARER_SHARE * depth
+            if separate or bend > FINE_STEP * depth:
                 second = walk(scene, neighbours, point[i], direction[i], other, hop_count)
                 if second.triangle >= 0 and second.t < hit.t:
                     if second.turned != 0:
@@ -191,6 +205,7 @@ def settle(
     gbuffer: GBuffer,
     pixels: MirrorPixels,
     target: raster.Target,
+    parents: wp.array,
     layer: ReflectionLayer,
     settings: Settings,
     trust_sky: bool,
@@ -198,7 +213,8 @@ def settle(
     """Write the hits that a virtual picture settles into the layer.
 
     Args:
-        target: The reflector's virtual z-buffer over `pixels.box`, ids are scene triangles.
+        target: The reflector's virtual z-buffer over `pixels.box`, ids are virtual triangles.
+        parents: int32, the scene triangle of each virtual triangle.
         layer: Receives triangle, u, v, distance, status of the settled pixels, and their counts.
         trust_sky: No virtual triangle was dropped: an empty neighbourhood is sky.
 
@@ -209,7 +225,16 @@ def settle(
     launch(
         settle_kernel,
         pixels.count,
-        [scene.view, scene.neighbours, target.view, pixels.pixel, pixels.point, pixels.direction]
+        [
+            scene.view,
+            scene.neighbours,
+            scene.closed_patches,
+            target.view,
+            parents,
+            pixels.pixel,
+            pixels.point,
+            pixels.direction,
+        ]
         + [settings.walk_hops, int(trust_sky)]
         + [layer.triangle, layer.u, layer.v, layer.distance, layer.status, settled],
         scene.device,

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from warp_reflect.bodies import weld
 from warp_reflect.cubemap import max_abs, project_to_cube
 from warp_reflect.launch import launch
 from warp_reflect.layers import Camera, CameraView, GBuffer, MirrorPixels, ReflectionLayer, Reflector, project
@@ -25,7 +26,7 @@ from warp_reflect.reflector_maps import MapSample, ReflectorMap, ReflectorMapVie
 from warp_reflect.scene import PartRange, Scene
 from warp_reflect.settings import Settings, Status, Technique
 from warp_reflect.techniques import forward, grid
-from warp_reflect.techniques.forward import SolveFrame, VertexView, virtual_vertex
+from warp_reflect.techniques.forward import SolveFrame, VertexView, depth_reach, edge_reach, virtual_vertex
 from warp_reflect.techniques.grid import GridView, corner_weight
 
 wp.set_module_options({"enable_backward": False})
@@ -51,6 +52,7 @@ MIDPOINT_DELTA = wp.constant(0.5)  # |b_m - b| / |b| steered to; best factor per
 CONVERGED = wp.constant(int(Status.CONVERGED))
 HIDDEN = wp.constant(int(Status.HIDDEN))
 MAX_ITERATIONS = wp.constant(int(Status.MAX_ITERATIONS))
+EDGE_SINE_MAX = 0.3  # 17 degrees; facets of a coarse but smooth body stay below, the rim of a cylinder is far above
 GRAZING_COS = wp.constant(0.1)  # cosine of incidence below which a search without a root lies on the silhouette
 SEARCH_MIDPOINT = wp.constant(1)
 
@@ -183,9 +185,7 @@ def newton_step(s: MapSample, eye: wp.vec3, target: wp.vec3) -> wp.vec3:
         s11 = wp.max((b11 * a22 - b12 * a21) * inv_p, 0.0)
         s22 = wp.max((b22 * a11 - b21 * a12) * inv_p, 0.0)
         bound = wp.sqrt(s11 * s22)
-        s12 = wp.clamp(
-            0.5 * ((b12 * a11 - b11 * a12) + (b21 * a22 - b22 * a21)) * inv_p, -bound, bound
-        )
+        s12 = wp.clamp(0.5 * ((b12 * a11 - b11 * a12) + (b21 * a22 - b22 * a21)) * inv_p, -bound, bound)
     k = wp.max(w_n, 0.0)
     h11 = (1.0 - o1 * o1) * inv_o + (1.0 - v1 * v1) * inv_v + k * s11
     h22 = (1.0 - o2 * o2) * inv_o + (1.0 - v2 * v2) * inv_v + k * s22
@@ -410,6 +410,9 @@ def solve_vertex(
         out_vertex.status[i] = wp.uint8(wp.where(grazing, HIDDEN, MAX_ITERATIONS))
         return
     out_vertex.status[i] = wp.uint8(CONVERGED)
+    out_vertex.reach[i] = wp.vec2(
+        edge_reach(frame, r.p, r.n, target, map.least_curvature), depth_reach(frame, r.p, target)
+    )
     q = virtual_vertex(frame, r.p, r.n, target)
     out_vertex.screen[i] = project(camera, q)
     if out_vertex.position.shape[0] > 0:
@@ -467,7 +470,9 @@ def grid_kernel(
     if i >= own_first and i < own_first + own_count:
         return
     target = frame.unit_from_scene * points[i] + frame.unit_offset
-    cell = grid_view.vertex_cell[i]
+    cell = int(-1)
+    if i < grid_view.vertex_cell.shape[0]:  # beyond: vertices of cut triangles
+        cell = grid_view.vertex_cell[i]
     x = wp.vec3(0.0, 0.0, 0.0)
     position = wp.vec3(0.0, 0.0, 0.0)
     solved = int(0)
@@ -508,6 +513,9 @@ def grid_kernel(
                 out_vertex.seed[i] = x
                 out_vertex.residual[i] = r.residual
                 out_vertex.status[i] = wp.uint8(CONVERGED)
+                out_vertex.reach[i] = wp.vec2(
+                    edge_reach(frame, r.p, r.n, target, map.least_curvature), depth_reach(frame, r.p, target)
+                )
                 out_vertex.screen[i] = project(camera, virtual_vertex(frame, r.p, r.n, target))
                 return
     solve_vertex(map, frame, camera, settings, target, wp.vec3(0.0, 0.0, 0.0), i, out_vertex)
@@ -568,11 +576,33 @@ def part_mesh(scene: Scene, part: PartRange) -> tuple[np.ndarray, np.ndarray, np
 
 
 def applies(scene: Scene, reflector: Reflector) -> tuple[bool, str]:
-    """A closed convex body can be held by one map."""
+    """A closed convex body without sharp edges can be held by one map."""
     body = scene.body(reflector.part)
-    if body.convex:
-        return True, "closed convex body: one reflection point per vertex"
-    return False, body.reason or "not convex: several reflection points per vertex"
+    if not body.convex:
+        return False, body.reason or "not convex: several reflection points per vertex"
+    sine = _sharpest(*part_mesh(scene, scene.parts[reflector.part]))
+    if sine > EDGE_SINE_MAX:
+        return (
+            False,
+            f"sharp edges: its normals jump by a sine of {sine:.2f} (at most {EDGE_SINE_MAX}); a map smooths them",
+        )
+    return True, "closed convex smooth body: one reflection point per vertex"
+
+
+def _sharpest(points: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> float:
+    """Largest sine between the corner normals of two facets at a point they share (facets at a right angle or more: 1)."""
+    corner = weld(points, faces).reshape(-1)
+    flat = normals.reshape(-1, 3)
+    order = np.argsort(corner, kind="stable")
+    starts = np.flatnonzero(np.r_[True, np.diff(corner[order]) > 0])
+    middle = np.add.reduceat(flat[order], starts)
+    middle /= np.maximum(np.linalg.norm(middle, axis=1, keepdims=True), 1.0e-300)
+    spread = np.repeat(middle, np.diff(np.r_[starts, len(order)]), axis=0)
+    cosine = np.einsum("ij,ij->i", spread, flat[order])
+    sine = np.linalg.norm(np.cross(spread, flat[order]), axis=1)
+    # From the mean of both: the jump itself is twice that.
+    half = float(np.where(cosine > 0.0, sine, 1.0).max())
+    return min(1.0, 2.0 * half)
 
 
 def prepare(scene: Scene, reflector: Reflector, settings: Settings) -> Prepared:
@@ -669,27 +699,26 @@ def reflect(
     part = scene.parts[prepared.reflector.part]
     chosen = search_settings(settings, prepared.map.resolution)
 
-    mirror = [*forward.own_vertices(part), prepared.map.view]
-
-    def solve_vertices(frame: SolveFrame, warm: bool, out_vertex: VertexView) -> None:
+    def solve_vertices(points, has_own: bool, frame: SolveFrame, warm: bool, out_vertex: VertexView) -> None:
+        mirror = [*(forward.own_vertices(part) if has_own else [0, 0]), prepared.map.view]
         common = [frame, gbuffer.view, chosen]
         cells = prepared.grid
-        if cells is None:
-            inputs = [scene.view.points, *mirror, *common, int(warm), out_vertex]
-            launch(search_kernel, scene.vertex_count, inputs, scene.device, settings.threads)
+        if cells is None or not has_own:
+            inputs = [points, *mirror, *common, int(warm), out_vertex]
+            launch(search_kernel, len(points), inputs, scene.device, settings.threads)
             return
         positions = settings.grid_kind == "position"
         node = forward.empty_vertices(cells.node_count, scene.device, with_position=positions)
         inputs = [cells.view.nodes, 0, 0, prepared.map.view, *common, 0, node]
         launch(search_kernel, cells.node_count, inputs, scene.device, settings.threads)
-        inputs = [scene.view.points, *mirror, *common, cells.view, node, int(positions), out_vertex]
-        launch(grid_kernel, scene.vertex_count, inputs, scene.device, settings.threads)
+        inputs = [points, *mirror, *common, cells.view, node, int(positions), out_vertex]
+        launch(grid_kernel, len(points), inputs, scene.device, settings.threads)
 
-    def solve_boundary(frame: SolveFrame, edges: wp.array, out_point: wp.array) -> None:
+    def solve_boundary(points, frame: SolveFrame, edges: wp.array, out_point: wp.array) -> None:
         launch(
             boundary_kernel,
             len(edges),
-            [scene.view.points, prepared.map.view, frame, edges, forward.BOUNDARY_STEPS, out_point],
+            [points, prepared.map.view, frame, edges, forward.BOUNDARY_STEPS, out_point],
             scene.device,
             settings.threads,
         )

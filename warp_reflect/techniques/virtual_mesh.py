@@ -1,0 +1,192 @@
+"""The mesh that forward techniques reflect: a scene without the mirror, large triangles cut where their picture bends.
+
+A straight edge reflects as a curve, but a virtual triangle has straight edges: where the error estimate of a triangle
+exceeds a tolerance it is replaced by a lattice of smaller ones (the limit that Estalella et al. 2005, section 8, and Ofek
+and Rappoport 1998 leave open). Neighbours may be cut differently; the gaps along their edges are left to refinement.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import warp as wp
+
+from warp_reflect.launch import launch
+from warp_reflect.scene import PartRange, Scene
+from warp_reflect.settings import Status
+
+wp.set_module_options({"enable_backward": False})
+
+CONVERGED = wp.constant(int(Status.CONVERGED))
+CUT_MAX = wp.constant(32)  # pieces along an edge; a lattice of 32 has 1024 triangles
+CUT_SLACK = 1.5  # the tolerance is divided by it when cutting, so that a moving eye does not cut anew every frame
+BUDGET_SHARE = 2.0  # new triangles per triangle of the scene (beside BUDGET_MIN) before the tolerance is relaxed
+BUDGET_MIN = 20000
+RELAX = 4.0  # factor of the tolerance per attempt to meet the budget
+RELAX_STEPS = 12  # 4^11 times the tolerance cuts nothing any more
+BOX_MARGIN = wp.constant(8.0)  # pixels around a virtual triangle's straight picture that its bent one may reach
+
+
+@dataclass
+class VirtualMesh:
+    """Vertices and triangles of a scene as one mirror reflects them.
+
+    Attributes:
+        points: vec3 [vertex_count], scene frame; the scene's own vertices first.
+        triangles: vec3i [triangle_count], without the mirror's own and without those that were cut.
+        parents: int32 [triangle_count], the scene triangle each belongs to.
+        cuts: uint8 [scene triangle_count], pieces along an edge, 1 where whole.
+        relaxed: Multiple of the tolerance asked that the cuts were made for, 1 unless the budget was short.
+    """
+
+    points: wp.array
+    triangles: wp.array
+    parents: wp.array
+    host_triangles: np.ndarray
+    host_parents: np.ndarray
+    base_count: int
+    cuts: np.ndarray
+    relaxed: float
+
+    @property
+    def vertex_count(self) -> int:
+        return len(self.points)
+
+
+@wp.kernel
+def cut_kernel(
+    first: int,
+    triangles: wp.array(dtype=wp.vec3i),
+    points: wp.array(dtype=wp.vec3),
+    screen: wp.array(dtype=wp.vec4),
+    status: wp.array(dtype=wp.uint8),
+    reach: wp.array(dtype=wp.vec2),
+    unit_per_scene: float,
+    tolerance_root: float,
+    relaxed_root: float,
+    box: wp.vec4,
+    out_cut: wp.array(dtype=wp.uint8),
+):
+    """One thread per scene triangle: pieces along an edge, a power of two."""
+    i = first + wp.tid()
+    t = triangles[i]
+    a = points[t[0]]
+    b = points[t[1]]
+    c = points[t[2]]
+    longest = wp.max(wp.length(b - a), wp.max(wp.length(c - b), wp.length(a - c))) * unit_per_scene
+    shortest = float(1.0e30)
+    left = float(1.0e30)
+    right = float(-1.0e30)
+    top = float(1.0e30)
+    bottom = float(-1.0e30)
+    for k in range(3):
+        v = t[k]
+        if int(status[v]) == CONVERGED and reach[v][0] > 0.0:
+            shortest = wp.min(shortest, wp.min(reach[v][0] * tolerance_root, reach[v][1]) * relaxed_root)
+            p = screen[v]
+            if p[2] > 0.0:
+                left = wp.min(left, p[0])
+                right = wp.max(right, p[0])
+                top = wp.min(top, p[1])
+                bottom = wp.max(bottom, p[1])
+    pieces = int(1)
+    if longest > shortest:
+        margin = BOX_MARGIN + 0.5 * wp.max(right - left, bottom - top)
+        seen = (
+            right + margin >= box[0]
+            and left - margin <= box[2]
+            and bottom + margin >= box[1]
+            and top - margin <= box[3]
+        )
+        if seen:
+            while pieces < CUT_MAX and longest > shortest * float(pieces):
+                pieces = pieces * 2
+    out_cut[i] = wp.uint8(pieces)
+
+
+def needed_cuts(
+    scene: Scene, vertices, unit_per_scene: float, tolerance: float, relaxed: float, box, threads: int
+) -> np.ndarray:
+    """Pieces per scene triangle, uint8 [triangle_count].
+
+    Args:
+        tolerance: Bending of an edge's picture. [radians]
+        relaxed: Multiple of the tolerances, of the picture and of depth, that is allowed.
+    """
+    cut = wp.empty(scene.triangle_count, dtype=wp.uint8, device=scene.device)
+    inputs = [scene.view.triangles, scene.view.points, vertices.screen, vertices.status, vertices.reach]
+    inputs += [unit_per_scene, float(np.sqrt(tolerance)), float(np.sqrt(relaxed))]
+    inputs += [wp.vec4(*(float(side) for side in box)), cut]
+    launch(cut_kernel, scene.triangle_count, inputs, scene.device, threads)
+    return cut.numpy()
+
+
+def whole(scene: Scene, part: PartRange) -> VirtualMesh:
+    """The scene without the mirror, nothing cut."""
+    return cut_mesh(scene, part, np.ones(scene.triangle_count, np.uint8), 1.0)
+
+
+def within_budget(cuts_for, scene: Scene) -> tuple[np.ndarray, float]:
+    """Cuts for the tolerance, or for the smallest multiple of it whose triangles fit the budget, and that multiple.
+
+    Args:
+        cuts_for: (multiple of the tolerance) -> cuts.
+    """
+    budget = BUDGET_MIN + BUDGET_SHARE * scene.triangle_count
+    relaxed = 1.0
+    for _ in range(RELAX_STEPS):
+        cuts = cuts_for(relaxed)
+        if float((cuts.astype(np.int64) ** 2 * (cuts > 1)).sum()) <= budget:
+            return cuts, relaxed
+        relaxed *= RELAX
+    return np.ones_like(cuts), relaxed
+
+
+def cut_mesh(scene: Scene, part: PartRange, cuts: np.ndarray, relaxed: float) -> VirtualMesh:
+    """Replace every triangle with cuts > 1 by its lattice; drop the mirror's own."""
+    own = slice(part.first_triangle, part.first_triangle + part.triangle_count)
+    cuts = cuts.copy()
+    cuts[own] = 1
+    kept = cuts == 1
+    kept[own] = False
+    points, triangles, parents = [scene.host_points], [scene.host_triangles[kept]], [np.flatnonzero(kept)]
+    count = scene.vertex_count
+    for pieces in np.unique(cuts[cuts > 1]):
+        ids = np.flatnonzero(cuts == pieces)
+        weights, lattice = _lattice(int(pieces))
+        corner = scene.host_points[scene.host_triangles[ids]]
+        points.append(np.einsum("lk,tkj->tlj", weights, corner).reshape(-1, 3).astype(np.float32))
+        first = count + np.arange(len(ids)) * len(weights)
+        triangles.append((lattice[None] + first[:, None, None]).reshape(-1, 3))
+        parents.append(np.repeat(ids, len(lattice)))
+        count += len(ids) * len(weights)
+    host_triangles = np.concatenate(triangles).astype(np.int32)
+    host_parents = np.concatenate(parents).astype(np.int32)
+    device = scene.device
+    return VirtualMesh(
+        wp.array(np.concatenate(points), dtype=wp.vec3, device=device),
+        wp.array(host_triangles, dtype=wp.vec3i, device=device),
+        wp.array(host_parents, dtype=int, device=device),
+        host_triangles,
+        host_parents,
+        scene.vertex_count,
+        cuts,
+        relaxed,
+    )
+
+
+@cache
+def _lattice(pieces: int) -> tuple[np.ndarray, np.ndarray]:
+    """(corner weights [vertex_count, 3], triangles [pieces^2, 3]) of a triangle cut into pieces along each edge."""
+    row, column = np.meshgrid(np.arange(pieces + 1), np.arange(pieces + 1), indexing="ij")
+    inside = row + column <= pieces
+    number = np.full(inside.shape, -1)
+    number[inside] = np.arange(inside.sum())
+    b, c = row[inside] / pieces, column[inside] / pieces
+    i, j = np.nonzero(inside[:-1, :-1] & (row + column < pieces)[:-1, :-1])
+    up = np.stack([number[i, j], number[i + 1, j], number[i, j + 1]], 1)
+    i, j = np.nonzero((row + column < pieces - 1)[:-1, :-1])
+    down = np.stack([number[i + 1, j], number[i + 1, j + 1], number[i, j + 1]], 1)
+    return np.stack([1.0 - b - c, b, c], 1), np.concatenate([up, down])
