@@ -12,6 +12,7 @@ import warp as wp
 
 from warp_reflect.mirrors import QuadricMirror
 from warp_reflect.optics import safe_length, safe_normalize, specular_residual, virtual_point
+from warp_reflect.quadric_curve import qim_search
 from warp_reflect.quadric_roots import FLAG_RING, all_reflections, flatness
 from warp_reflect.quadrics import (
     FAMILY,
@@ -26,9 +27,12 @@ from warp_reflect.quadrics import (
 )
 from warp_reflect.settings import Status
 
+# Every kernel is a Warp module of its own: who asks for a sphere compiles no plane and no scan for all roots.
 # Unrolled, the searches in loops of known length would be compiled many times over.
-wp.set_module_options({"enable_backward": False, "max_unroll": 2})
+OPTIONS = {"enable_backward": False, "max_unroll": 2}
+wp.set_module_options(OPTIONS)
 
+NONE = wp.constant(int(Status.NONE))
 CONVERGED = wp.constant(int(Status.CONVERGED))
 HIDDEN = wp.constant(int(Status.HIDDEN))
 UNREFLECTED = wp.constant(int(Status.UNREFLECTED))
@@ -125,7 +129,7 @@ def normal_curvature(n: wp.vec3d, along: wp.vec3d, lam: wp.vec3d, n_length: wp.f
 # Planes
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)
 def solve_plane_kernel(
     first: int,
     eyes: wp.array(dtype=wp.vec3d),
@@ -340,10 +344,8 @@ def search_convex(
 
 
 @wp.func
-def solve_sheet(
-    eye: wp.vec3d, target: wp.vec3d, near: Any, warm: int, view: QuadricView, sheet: int, roundoff: wp.float64
-):
-    """The one reflection point on a convex body, or on its part on one side of z = 0 (sheet != 0)."""
+def refuse(eye: wp.vec3d, target: wp.vec3d, view: QuadricView, sheet: int, roundoff: wp.float64):
+    """What needs no search on a convex body: status NONE where one is needed."""
     found = Found()
     limit = wp.float64(TOUCHING) * roundoff
     eye_height = signed_distance(eye, view.lam, view.b, view.c)
@@ -355,14 +357,22 @@ def solve_sheet(
     target_limit = limit * wp.max(wp.float64(1.0), wp.length(target))
     if eye_here and wp.abs(eye_height) <= eye_limit:
         found.status = BAD_INPUT
-        return found
-    if (eye_here and eye_height < wp.float64(0.0)) or (target_here and target_height < -target_limit):
+    elif (eye_here and eye_height < wp.float64(0.0)) or (target_here and target_height < -target_limit):
         found.status = INSIDE
-        return found
-    if target_here and target_height <= target_limit:
-        return touch(target, eye, view.lam, view.b)
-    if chord_enters(eye, target, view.lam, view.b, view.c, sheet):
+    elif target_here and target_height <= target_limit:
+        found = touch(target, eye, view.lam, view.b)
+    elif chord_enters(eye, target, view.lam, view.b, view.c, sheet):
         found.status = HIDDEN
+    return found
+
+
+@wp.func
+def solve_sheet(
+    eye: wp.vec3d, target: wp.vec3d, near: Any, warm: int, view: QuadricView, sheet: int, roundoff: wp.float64
+):
+    """The one reflection point on a convex body, or on its part on one side of z = 0 (sheet != 0)."""
+    found = refuse(eye, target, view, sheet, roundoff)
+    if found.status != NONE:
         return found
     flip = wp.float64(1.0)
     if sheet < 0:
@@ -405,7 +415,7 @@ def has_point(status: int):
     )
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)
 def solve_convex_kernel(
     first: int,
     eyes: wp.array(dtype=wp.vec3d),
@@ -512,7 +522,7 @@ def write_root(
     out_root_status[row, slot] = wp.uint8(found.status)
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)
 def solve_general_kernel(
     first: int,
     eyes: wp.array(dtype=wp.vec3d),
@@ -619,6 +629,79 @@ def solve_general_kernel(
     write_answer(zero, best, view, row, out_point, out_normal, out_virtual, out_residual)
 
 
+@wp.kernel(module="unique", module_options=OPTIONS)
+def solve_qim_kernel(
+    first: int,
+    eyes: wp.array(dtype=wp.vec3d),
+    points: wp.array(dtype=Any),
+    view: QuadricView,
+    # Outputs:
+    out_point: wp.array(dtype=Any),
+    out_normal: wp.array(dtype=Any),
+    out_virtual: wp.array(dtype=Any),
+    out_residual: wp.array(dtype=Any),
+    out_status: wp.array(dtype=wp.uint8),
+):
+    """One thread per pair of eye and point; convex surfaces of revolution with one sheet."""
+    row = first + wp.tid()
+    n = points.shape[0]
+    zero = points[row % n]
+    eye_world = eyes[row / n]
+    target_world = to_double(zero)
+    if not finite(eye_world) or not finite(target_world):
+        out_status[row] = wp.uint8(BAD_INPUT)
+        return
+    eye = view.unit_from_world * (eye_world - view.origin)
+    target = view.unit_from_world * (target_world - view.origin)
+    roundoff = wp.float64(unit_roundoff(zero[0]))
+    sheet = view.sheet
+    if view.family == 2 and sheet == 0:
+        sheet = 1
+        if eye[2] < wp.float64(0.0):
+            sheet = -1
+    found = refuse(eye, target, view, sheet, roundoff)
+    if found.status == NONE:
+        flip = wp.float64(1.0)
+        if sheet < 0:
+            flip = wp.float64(-1.0)
+        far = near_limit(zero[0])
+        e = cut_far(wp.vec3d(eye[0], eye[1], flip * eye[2]), far)
+        t = cut_far(wp.vec3d(target[0], target[1], flip * target[2]), far)
+        # The nearest-point map shortens distances: R is no farther from the vertex than eye or target.
+        reach = wp.max(wp.length(e), wp.length(t))
+        low = wp.float64(0.0)
+        high = reach
+        if view.family == 0:
+            if view.lam[2] > wp.float64(0.0):
+                high = wp.float64(1.0) / wp.sqrt(view.lam[2])
+                low = -high
+            else:
+                low = wp.min(e[2], t[2])
+                high = wp.max(e[2], t[2])
+        elif view.family == 2:
+            low = wp.sqrt(view.c / -view.lam[2])
+            high = low + wp.float64(2.0) * reach
+        s_lam = type(zero)(zero.dtype(view.lam[0]), zero.dtype(view.lam[1]), zero.dtype(view.lam[2]))
+        p, there = qim_search(
+            type(zero)(zero.dtype(e[0]), zero.dtype(e[1]), zero.dtype(e[2])),
+            type(zero)(zero.dtype(t[0]), zero.dtype(t[1]), zero.dtype(t[2])),
+            s_lam,
+            zero.dtype(view.b),
+            zero.dtype(view.c),
+            zero.dtype(low),
+            zero.dtype(high),
+        )
+        found.status = MAX_ITERATIONS
+        if there != 0:
+            r = wp.vec3d(wp.float64(p[0]), wp.float64(p[1]), flip * wp.float64(p[2]))
+            # A minimum is resolved to the root of the rounding.
+            found = judge(r, eye, target, view.lam, view.b, wp.sqrt(roundoff), grazing_limit(zero[0]))
+            write_answer(zero, found, view, row, out_point, out_normal, out_virtual, out_residual)
+    elif found.status == CONVERGED:
+        write_answer(zero, found, view, row, out_point, out_normal, out_virtual, out_residual)
+    out_status[row] = wp.uint8(found.status)
+
+
 def _overloads() -> None:
     """Declare both precisions, so that one module holds both and the first call of either compiles once."""
     scan = {}
@@ -633,6 +716,7 @@ def _overloads() -> None:
             "out_residual": number,
         }
         wp.overload(solve_plane_kernel, scan[vector])
+        wp.overload(solve_qim_kernel, scan[vector])
         roots = {"out_roots": two, "out_root_length": table}
         wp.overload(solve_general_kernel, scan[vector] | roots)
         wp.overload(solve_convex_kernel, scan[vector] | roots | {"start": one})

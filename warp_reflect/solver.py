@@ -24,6 +24,7 @@ from warp_reflect.solve_device import (
     solve_convex_kernel,
     solve_general_kernel,
     solve_plane_kernel,
+    solve_qim_kernel,
 )
 
 MAX_PAIRS = 2**31 - 1  # elements of one launch: kernels index with 32-bit integers
@@ -197,9 +198,7 @@ def solve(
     answer = solve_on_device(mirror, request)
     shape = (len(eyes), *given.shape) if several else given.shape
     out = lambda array: None if array is None else given.give_back(array, shape)  # noqa: E731
-    solution = Solution(
-        *(out(a) for a in (answer.point, answer.normal, answer.virtual, answer.residual)), None
-    )
+    solution = Solution(*(out(a) for a in (answer.point, answer.normal, answer.virtual, answer.residual)), None)
     solution.status = out(answer.status)
     if all_roots:
         solution.root_count = out(answer.root_count)
@@ -213,9 +212,7 @@ def solve(
 @singledispatch
 def solve_on_device(mirror, request: Request) -> Answer:
     """Solve a request for one type of mirror; others register theirs with `solve_on_device.register`."""
-    raise TypeError(
-        f"solve mirror: got {type(mirror).__name__}, expected PlanarMirror, QuadricMirror or ReflectorMap"
-    )
+    raise TypeError(f"solve mirror: got {type(mirror).__name__}, expected PlanarMirror, QuadricMirror or ReflectorMap")
 
 
 # --------------------------------------------------------------------------------------------------
@@ -257,9 +254,7 @@ def _as_vectors(array: wp.array, name: str) -> wp.array:
         return array.contiguous().flatten()
     vector = {wp.float32: wp.vec3, wp.float64: wp.vec3d}.get(array.dtype)
     if vector is None:
-        raise TypeError(
-            f"solve {name}: got a Warp array of {array.dtype.__name__}, expected vec3, vec3d or floats"
-        )
+        raise TypeError(f"solve {name}: got a Warp array of {array.dtype.__name__}, expected vec3, vec3d or floats")
     if array.shape[-1] != 3:
         raise ValueError(f"solve {name}: got shape {tuple(array.shape)}, expected a last axis of 3")
     whole = array.contiguous()
@@ -314,9 +309,7 @@ def _host_vectors(eye, name: str) -> np.ndarray:
 @solve_on_device.register
 def _(mirror: PlanarMirror, request: Request) -> Answer:
     if request.method != "newton":
-        raise ValueError(
-            f"solve method: {request.method!r} is for quadrics of revolution; a plane needs none"
-        )
+        raise ValueError(f"solve method: {request.method!r} is for quadrics of revolution; a plane needs none")
     answer = Answer.empty(request, 1)
     half_width, half_height = mirror.extent or (0.0, 0.0)
     frame = [wp.vec3d(x) for x in (mirror.point, mirror.normal, mirror.width_axis, mirror.height_axis)]
@@ -333,6 +326,14 @@ def _(mirror: QuadricMirror, request: Request) -> Answer:
     outputs = [answer.point, answer.normal, answer.virtual, answer.residual, answer.status]
     outputs += [answer.root_count, answer.roots, answer.root_length, answer.root_index, answer.root_status]
     device, threads = request.points.device, request.threads
+    if request.method == "qim":
+        if not mirror.convex or mirror.canonical.equal < 2 or request.all_roots:
+            raise ValueError(
+                "solve method 'qim': the curve search finds the one point on a convex surface of revolution; "
+                "use method='newton' for other quadrics, other sides and all roots"
+            )
+        launch(solve_qim_kernel, request.count, [request.eyes, request.points, view, *outputs[:5]], device, threads)
+        return answer
     if mirror.convex:
         warm = request.start is not None
         start = request.start if warm else request.points
