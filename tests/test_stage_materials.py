@@ -88,7 +88,7 @@ def test_texture_is_described_whole(stage, tmp_path):
     assert color.wrap == ("repeat", "mirror") and color.uv_name == "st"
     assert color.scale == (2, 2, 2, 1) and color.bias == (-1, -1, -1, 0)
     np.testing.assert_allclose(color.uv_from_st, [[0, -3, 0.25], [2, 0, 0.5]], atol=1e-15)
-    assert material.base_color == pytest.approx((0.1, 0.2, 0.3)) and material.roughness == pytest.approx(0.1)
+    assert material.base_color == pytest.approx((0.1, 0.2, 0.3)) and material.roughness == pytest.approx(0.2)
     mesh = data.meshes[0]
     np.testing.assert_array_equal(mesh.uvs[mesh.uv_index][:, :, :2], mesh.points[mesh.triangles][:, :, :2] / 2 + 0.5)
 

@@ -111,7 +111,7 @@ class TextureRef:
 class MaterialData:
     """UsdPreviewSurface parameters; colours linear Rec.709.
 
-    A parameter with a texture holds what to use without it: the texture's fallback.
+    A parameter with a texture holds what to use without it: its authored fallback, else the surface's default.
     """
 
     path: str = ""

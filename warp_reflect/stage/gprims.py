@@ -158,7 +158,7 @@ def _side_rings(r0: float, r1: float, z0: float, z1: float, segments: int, level
         wide = max(r0, r1)
         unit = np.diag([1.0 / wide, 1.0 / wide, abs(slope) / (wide * height), 1.0])
         unit[2, 3] = -unit[2, 2] * apex
-        low, high = (unit[2, 2] * (z - apex) for z in (z0, z1))
+        low, high = (float(unit[2, 2] * (z - apex)) for z in (z0, z1))
         shape = Shape("quadric", unit, a=-1.0, b=0.0, c=0.0, z_min=low, z_max=high)
     return _Side(points, (triangles, around, normal_index, shape), bottom, top)
 

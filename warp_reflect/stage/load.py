@@ -16,6 +16,8 @@ def load_stage(
     complexity: str = "low",
     strict: bool = False,
     reflectors: tuple[str, ...] = (),
+    untrusted: bool = False,
+    root: str | Path = "",
 ) -> Scene:
     """Read a USD stage at one time and put it on a device.
 
@@ -30,16 +32,22 @@ def load_stage(
         strict: Raise for a prim that would be dropped or repaired with a note.
         reflectors: Patterns of prims, materials or collections that get a mirror's material, whatever the
             stage says; see `override_reflectors`.
+        untrusted: Read in a child process with bounded memory and time, confined to `root` or, where it is empty, to
+            the stage's folder.
+        root: Folder that layers and pictures must lie in; empty: anywhere, unless untrusted.
 
     Raises:
         FileNotFoundError: no such file.
         ValueError: not a stage, an impossible argument, or (strict) a bad prim; one line.
     """
+    from warp_reflect.stage.guard import Limits, read_untrusted
     from warp_reflect.stage.read import StageReader
 
-    reader = StageReader(path, purposes, complexity, strict, reflectors=reflectors)
+    arguments = path, purposes, complexity, strict, Limits(root=str(root)), reflectors
+    reader = None if untrusted else StageReader(*arguments)
 
     def at(code: float | None) -> Scene:
-        return Scene(reader.read(code), device, reload=at)
+        data = read_untrusted(path, code, *arguments[1:]) if reader is None else reader.read(code)
+        return Scene(data, device, reload=at)
 
     return at(time)

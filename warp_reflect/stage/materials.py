@@ -13,6 +13,7 @@ from warp_reflect.stage.intake import Intake
 from warp_reflect.stage.primvars import display_color, read_primvar
 from warp_reflect.stage.textures import is_texture, read_texture, scaled, value_of
 
+SHADED_TEXTURES: tuple[str, ...] = ()  # fields of MaterialData whose textures shade.py looks up
 NODE_HOPS_MAX = 16  # nodes followed from a surface input; longer chains (and cycles) are not evaluated
 PASS_THROUGH = ("ND_convert_", "ND_dot_", "ND_normalmap")
 EXTRACTED = ("r", "g", "b", "a")
@@ -228,6 +229,9 @@ def _read_surface(shader: UsdShade.Shader, parameters, path: str, intake: Intake
             values[parameter.field] = tuple(float(weight * v) for v in value)
         else:
             values[parameter.field] = float(value)
+    unshaded = sorted(set(textures) - set(SHADED_TEXTURES))
+    if unshaded:
+        intake.note(path, f"textures of {', '.join(unshaded)} are read but not shaded; constants are used")
     workflow = value_of(shader, "useSpecularWorkflow", intake)
     values["specular_workflow"] = workflow == 1
     for name, idle in UNUSED.items():
@@ -263,7 +267,10 @@ def _evaluate(shader: UsdShade.Shader, parameter: _Parameter, intake: Intake):
         output = UsdShade.Output(attribute).GetBaseName()
         if is_texture(identifier):
             texture, fallback = read_texture(node, channel or output, parameter.width, intake)
-            value = _fitted(fallback[:3] if parameter.width == 3 else fallback[:1], parameter)
+            value = parameter.default
+            if fallback is not None:
+                first = EXTRACTED.index(channel or output) if (channel or output) in EXTRACTED else 0
+                value = _fitted(fallback[:3] if parameter.width == 3 else fallback[first : first + 1], parameter)
             return value if texture is None else (texture, value)
         if identifier.startswith(("UsdPrimvarReader", "ND_UsdPrimvarReader", "ND_geompropvalue", "ND_geomcolor")):
             key = "geomprop" if "geompropvalue" in identifier else "varname"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import math
 import re
-import stat
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,7 +12,7 @@ import numpy as np
 
 from warp_reflect.scene import SceneData
 from warp_reflect.settings import COMPLEXITIES
-from warp_reflect.stage.guard import Limits
+from warp_reflect.stage.guard import Limits, check_file, confinement_fault
 from warp_reflect.stage.intake import Intake  # before pxr: sets USDC_USE_PREAD
 
 from pxr import Sdf, Tf, Usd, UsdGeom, UsdUtils  # isort: skip
@@ -87,7 +86,7 @@ class StageReader:
         self.strict = strict
         self.reflectors = (reflectors,) if isinstance(reflectors, str) else tuple(reflectors)
         self.limits = limits or Limits()
-        self.stage = open_stage(self.path)
+        self.stage = open_stage(self.path, self.limits)
         self._static: dict[tuple, MeshEntry] = {}
         self._pictures: dict = {}
 
@@ -170,25 +169,24 @@ class StageReader:
         )
 
 
-def open_stage(path: str) -> Usd.Stage:
+def open_stage(path: str, limits: Limits) -> Usd.Stage:
     """Open a stage file with everything loaded.
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: no regular file, or not readable as USD; one line.
+        ValueError: no regular file, not readable as USD, or outside of `limits.root`; one line.
     """
-    try:
-        mode = Path(path).stat().st_mode
-    except (OSError, ValueError) as fault:
-        raise FileNotFoundError(f"no such stage: {path} ({_one_line(str(fault))})") from None
-    if not stat.S_ISREG(mode):
-        raise ValueError(f"{path}: not a regular file")
+    check_file(path, limits)
     with quiet():
         try:
             known = Sdf.Layer.Find(path)
             stage = Usd.Stage.Open(path, Usd.Stage.LoadAll)
             if known and not known.dirty:
                 stage.Reload()  # else the library answers from memory although the file has changed
+            for layer in stage.GetUsedLayers() if limits.root else ():
+                fault = confinement_fault(layer.realPath, limits.root) if layer.realPath else ""
+                if fault:
+                    raise ValueError(f"cannot read {path}: the layer {layer.realPath} is {fault}")
         except Tf.ErrorException as fault:
             raise ValueError(f"cannot read {path}: {_tf_message(fault)}") from None
     return stage

@@ -46,13 +46,15 @@ def read_texture(node: UsdShade.Shader, output: str, width: int, intake: Intake)
         intake: The reading.
 
     Returns:
-        (texture or None, fallback float64 [4]): None, with a note, where there is no picture to use.
+        (texture or None, fallback): None for the picture, with a note, where there is none to use; None for
+        the fallback, float64 [4] red to alpha, where none is authored.
     """
     path = node.GetPath()
     identifier = node.GetIdAttr().Get()
     names = PREVIEW_INPUTS if "UsdUVTexture" in identifier else MATERIALX_INPUTS
     coordinates, wrap_u, wrap_v, fallback_name = names
-    fallback = _vector(value_of(node, fallback_name, intake), (0.0, 0.0, 0.0, 1.0))
+    authored = value_of(node, fallback_name, intake)
+    fallback = None if authored is None else _vector(authored, (0.0, 0.0, 0.0, 1.0))
     asset, attribute = _asset(node, intake)
     file = resolve_asset(asset, attribute, intake)
     if not file:
