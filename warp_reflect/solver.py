@@ -19,13 +19,11 @@ import warp as wp
 
 from warp_reflect.launch import launch
 from warp_reflect.mirrors import PlanarMirror, QuadricMirror
-from warp_reflect.solve_device import (
-    quadric_view,
-    solve_convex_kernel,
-    solve_general_kernel,
-    solve_plane_kernel,
-    solve_qim_kernel,
-)
+from warp_reflect.solve_convex import solve_convex_kernel
+from warp_reflect.solve_device import quadric_view
+from warp_reflect.solve_general import solve_general_kernel
+from warp_reflect.solve_plane import solve_plane_kernel
+from warp_reflect.solve_qim import solve_qim_kernel
 
 MAX_PAIRS = 2**31 - 1  # elements of one launch: kernels index with 32-bit integers
 
