@@ -32,17 +32,28 @@ def device(request: pytest.FixtureRequest) -> str:
 
 
 @pytest.fixture
-def assert_images_close(tmp_path: Path):
-    """A check that leaves `_img.exr`, `_ref.exr` and `_error.exr` behind when two pictures differ."""
+def leave_images(tmp_path: Path):
+    """Writes `_img.exr`, `_ref.exr` and `_error.exr` of two pictures and says where; for a test about to fail."""
     from warp_reflect.images import write_exr
 
-    def check(image: np.ndarray, reference: np.ndarray, mean_abs: float, name: str = "picture") -> None:
+    def leave(image: np.ndarray, reference: np.ndarray, name: str = "picture") -> str:
         error = np.abs(np.asarray(image, np.float64) - np.asarray(reference, np.float64))
-        worst = float(np.mean(error))
-        if worst <= mean_abs:
-            return
         for suffix, pixels in (("img", image), ("ref", reference), ("error", error)):
             write_exr(tmp_path / f"{name}_{suffix}.exr", {"RGB": np.asarray(pixels)}, half=())
-        pytest.fail(f"{name}: mean absolute error {worst:.3g} > {mean_abs:.3g}; see {tmp_path}/{name}_*.exr")
+        return f"see {tmp_path}/{name}_*.exr"
+
+    return leave
+
+
+@pytest.fixture
+def assert_images_close(leave_images):
+    """A check that leaves pictures behind when two differ."""
+
+    def check(image: np.ndarray, reference: np.ndarray, mean_abs: float, name: str = "picture") -> None:
+        worst = float(np.mean(np.abs(np.asarray(image, np.float64) - np.asarray(reference, np.float64))))
+        # Not `worst > mean_abs`: a NaN in a picture fails too.
+        if not worst <= mean_abs:
+            where = leave_images(image, reference, name)
+            pytest.fail(f"{name}: mean absolute error {worst:.3g} > {mean_abs:.3g}; {where}")
 
     return check
