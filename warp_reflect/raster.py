@@ -18,8 +18,9 @@ import numpy as np
 import warp as wp
 
 from warp_reflect.launch import launch, launch_bands, slice_length
-from warp_reflect.layers import Camera, CameraView, GBuffer, project
+from warp_reflect.layers import Camera, CameraView, GBuffer, MirrorPixels, project
 from warp_reflect.scene import Scene
+from warp_reflect.shapes import unit
 
 wp.set_module_options({"enable_backward": False})
 
@@ -27,6 +28,9 @@ SUBPIXEL = wp.constant(256)  # positions per pixel
 HALF_PIXEL = wp.constant(128)
 # Pixels. Beyond it a triangle is clipped: 2^14 * 2^8 = 2^22 keeps every product below 2^46, far inside int64.
 GUARD = wp.constant(16384.0)
+RAY_ALONG_MIN = wp.constant(0.02)  # sine between a ray and a plane below which their crossing says nothing of depth
+# Of the path: a crossing farther than this from the virtual triangle's depth lies outside the triangle.
+RAY_TRUST = wp.constant(0.25)
 DROPPED = wp.constant(-1.0)  # depth key of a vertex that has no picture
 CLIP_VERTICES = 9  # a triangle against five planes has at most eight corners
 
@@ -49,6 +53,17 @@ class TargetView:
     near: float
     far: float
     orthographic: int
+    # Exact depth of virtual triangles (see `attach_rays`); length 0: the depth key is interpolated.
+    ray_origin: wp.array(dtype=wp.vec4)
+    ray_direction: wp.array(dtype=wp.vec4)
+
+
+@wp.struct
+class PlaneView:
+    """The plane n . x = offset of a triangle in the frame of the rays."""
+
+    n: wp.vec3
+    offset: float
 
 
 @dataclass
@@ -116,8 +131,36 @@ def pixel_step(d: wp.int64) -> wp.int64:
 
 
 @wp.func
+def ray_key(target: TargetView, cell: int, plane: PlaneView, interpolated: float) -> float:
+    """Depth key 1 / (eye -> mirror -> plane) of the ray of a cell.
+
+    Straight virtual triangles are wrong in depth; the ray's own distance to the triangle's plane orders them right. Where
+    the ray runs along the plane, or meets it far from where the virtual triangle says, the latter stands.
+    """
+    origin = target.ray_origin[cell]
+    direction = target.ray_direction[cell]
+    # The interpolated key is 1 / depth along the camera's axis; direction.w is the eye ray's length at depth 1.
+    path = direction[3] / interpolated
+    along = plane.n[0] * direction[0] + plane.n[1] * direction[1] + plane.n[2] * direction[2]
+    height = plane.offset - plane.n[0] * origin[0] - plane.n[1] * origin[1] - plane.n[2] * origin[2]
+    estimate = path - origin[3]
+    if wp.abs(along) > RAY_ALONG_MIN:
+        t = height / along
+        if wp.abs(t - estimate) < RAY_TRUST * path:
+            estimate = wp.max(t, 0.0)
+    return 1.0 / wp.max(origin[3] + estimate, 1.0e-30)
+
+
+@wp.func
 def draw_triangle(
-    target: TargetView, a: wp.vec3, b: wp.vec3, c: wp.vec3, triangle: int, row_first: int, row_end: int
+    target: TargetView,
+    a: wp.vec3,
+    b: wp.vec3,
+    c: wp.vec3,
+    plane: PlaneView,
+    triangle: int,
+    row_first: int,
+    row_end: int,
 ):
     """Draw one triangle of (x, y, key) corners into rows [row_first, row_end) of the image."""
     xa = snap(a[0])
@@ -178,6 +221,8 @@ def draw_triangle(
                     if target.mask_value > 0:
                         visible = target.mask[y * target.mask_width + x] == target.mask_value
                     if visible:
+                        if target.ray_origin.shape[0] > 0:
+                            depth_key = ray_key(target, cell + x, plane, depth_key)
                         wp.atomic_max(target.key, cell + x, pack_key(depth_key, triangle))
             ea -= pixel_step(dya)
             eb -= pixel_step(dyb)
@@ -219,7 +264,16 @@ def screen_corner(target: TargetView, v: wp.vec4) -> wp.vec3:
 
 
 @wp.func
-def draw_clipped(target: TargetView, a: wp.vec4, b: wp.vec4, c: wp.vec4, triangle: int, row_first: int, row_end: int):
+def draw_clipped(
+    target: TargetView,
+    a: wp.vec4,
+    b: wp.vec4,
+    c: wp.vec4,
+    plane: PlaneView,
+    triangle: int,
+    row_first: int,
+    row_end: int,
+):
     """Clip a triangle against the near plane and the guard band in homogeneous space, then draw it as a fan.
 
     Each crossing is computed from the corner inside to the corner outside, so that two triangles with a common edge
@@ -231,13 +285,13 @@ def draw_clipped(target: TargetView, a: wp.vec4, b: wp.vec4, c: wp.vec4, triangl
     polygon[1] = clip_corner(target, b)
     polygon[2] = clip_corner(target, c)
     count = int(3)
-    for plane in range(5):
+    for side in range(5):
         kept = int(0)
         for i in range(count):
             current = polygon[i]
             following = polygon[(i + 1) % count]
-            d0 = plane_distance(target, plane, current)
-            d1 = plane_distance(target, plane, following)
+            d0 = plane_distance(target, side, current)
+            d1 = plane_distance(target, side, following)
             if d0 >= 0.0 and kept < CLIP_VERTICES:
                 clipped[kept] = current
                 kept += 1
@@ -259,6 +313,7 @@ def draw_clipped(target: TargetView, a: wp.vec4, b: wp.vec4, c: wp.vec4, triangl
             corner,
             screen_corner(target, polygon[i]),
             screen_corner(target, polygon[i + 1]),
+            plane,
             triangle,
             row_first,
             row_end,
@@ -272,9 +327,8 @@ def covers_centre(target: TargetView, a: wp.vec4, b: wp.vec4, c: wp.vec4) -> boo
     right = last_centre(snap(wp.max(a[0], wp.max(b[0], c[0]))))
     top = first_centre(snap(wp.min(a[1], wp.min(b[1], c[1]))))
     bottom = last_centre(snap(wp.max(a[1], wp.max(b[1], c[1]))))
-    return (
-        wp.max(left, target.x0) <= wp.min(right, target.x1 - 1)
-        and wp.max(top, target.y0) <= wp.min(bottom, target.y1 - 1)
+    return wp.max(left, target.x0) <= wp.min(right, target.x1 - 1) and wp.max(top, target.y0) <= wp.min(
+        bottom, target.y1 - 1
     )
 
 
@@ -317,6 +371,8 @@ def draw_kernel(
     step: int,
     survivors: wp.array(dtype=int),
     survivor_count: wp.array(dtype=int),
+    points: wp.array(dtype=wp.vec3),
+    plane_triangles: wp.array(dtype=wp.vec3i),
     row_first: int,
     row_end: int,
 ):
@@ -333,14 +389,22 @@ def draw_kernel(
     triangle = t + id_offset
     if ids.shape[0] > 0:
         triangle = ids[t]
+    plane = PlaneView()
+    if target.ray_origin.shape[0] > 0:
+        own = plane_triangles[t]
+        p = points[own[0]]
+        # Unit length: RAY_ALONG_MIN is a sine.
+        plane.n = unit(wp.cross(points[own[1]] - p, points[own[2]] - p))
+        plane.offset = wp.dot(plane.n, p)
     if needs_clipping(a) or needs_clipping(b) or needs_clipping(c):
-        draw_clipped(target, a, b, c, triangle, row_first, row_end)
+        draw_clipped(target, a, b, c, plane, triangle, row_first, row_end)
     else:
         draw_triangle(
             target,
             wp.vec3(a[0], a[1], a[2]),
             wp.vec3(b[0], b[1], b[2]),
             wp.vec3(c[0], c[1], c[2]),
+            plane,
             triangle,
             row_first,
             row_end,
@@ -354,6 +418,43 @@ def project_kernel(
     """One thread per vertex."""
     i = first + wp.tid()
     out_screen[i] = project(camera, points[i] - camera.eye)
+
+
+@wp.kernel
+def ray_image_kernel(
+    first: int,
+    camera: CameraView,
+    pixel: wp.array(dtype=int),
+    point: wp.array(dtype=wp.vec3),
+    direction: wp.array(dtype=wp.vec3),
+    x0: int,
+    y0: int,
+    box_width: int,
+    out_origin: wp.array(dtype=wp.vec4),
+    out_direction: wp.array(dtype=wp.vec4),
+):
+    """One thread per mirror pixel: its ray, the eye's distance, and the eye ray's length at depth 1."""
+    i = first + wp.tid()
+    row = pixel[i] / camera.width
+    cell = (row - y0) * box_width + pixel[i] - row * camera.width - x0
+    p = point[i]
+    d = direction[i]
+    to_eye = p - camera.eye
+    distance = wp.length(to_eye)
+    out_origin[cell] = wp.vec4(p[0], p[1], p[2], distance)
+    out_direction[cell] = wp.vec4(d[0], d[1], d[2], distance / wp.max(wp.dot(camera.forward, to_eye), 1.0e-30))
+
+
+def attach_rays(target: Target, camera: CameraView, pixels: MirrorPixels, threads: int = 0) -> None:
+    """Give a target the reflected rays of its pixels: triangles drawn into it are ordered by exact path length."""
+    device = target.key.device
+    cells = len(target.key)
+    target.view.ray_origin = wp.empty(cells, dtype=wp.vec4, device=device)
+    target.view.ray_direction = wp.empty(cells, dtype=wp.vec4, device=device)
+    x0, y0, x1, _ = target.box
+    inputs = [camera, pixels.pixel, pixels.point, pixels.direction, x0, y0, x1 - x0]
+    inputs += [target.view.ray_origin, target.view.ray_direction]
+    launch(ray_image_kernel, pixels.count, inputs, device, threads)
 
 
 @wp.kernel
@@ -386,6 +487,8 @@ def make_target(
     view.near = camera.near
     view.far = camera.far
     view.orthographic = camera.orthographic
+    view.ray_origin = wp.empty(0, dtype=wp.vec4, device=device)
+    view.ray_direction = wp.empty(0, dtype=wp.vec4, device=device)
     return Target(view, key, box)
 
 
@@ -396,6 +499,8 @@ def rasterise(
     *,
     ids: wp.array | None = None,
     id_offset: int = 0,
+    points: wp.array | None = None,
+    plane_triangles: wp.array | None = None,
     threads: int = 0,
 ) -> int:
     """Draw triangles into a target; repeated calls accumulate.
@@ -406,6 +511,8 @@ def rasterise(
         triangles: vec3i [triangle_count], indices into `screen`.
         ids: int [triangle_count], what the z-buffer stores per triangle; None: the triangle's index + id_offset.
         id_offset: See `ids`.
+        points: vec3, where the target has rays: the triangles' real corners, in the frame of the rays.
+        plane_triangles: vec3i [triangle_count], indices into `points`; None: the triangles themselves.
         threads: CPU threads.
 
     Returns:
@@ -419,12 +526,13 @@ def rasterise(
     slice_count = -(-count // step)
     survivors = wp.empty(count, dtype=int, device=device)
     survivor_count = wp.zeros(slice_count, dtype=int, device=device)
-    launch(
-        cull_kernel, count, [target.view, screen, triangles, step, survivors, survivor_count], device, threads
-    )
+    launch(cull_kernel, count, [target.view, screen, triangles, step, survivors, survivor_count], device, threads)
     if ids is None:
         ids = wp.empty(0, dtype=int, device=device)
+    if points is None:
+        points = wp.empty(0, dtype=wp.vec3, device=device)
     inputs = [target.view, screen, triangles, ids, id_offset, step, survivors, survivor_count]
+    inputs += [points, triangles if plane_triangles is None else plane_triangles]
     if device.is_cuda:
         launch_bands(draw_kernel, [(0, count)], [(target.box[1], target.box[3])], inputs, device)
         return 0

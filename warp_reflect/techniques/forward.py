@@ -39,9 +39,6 @@ HIDDEN = wp.constant(int(Status.HIDDEN))
 MAX_ITERATIONS = wp.constant(int(Status.MAX_ITERATIONS))
 SKY = wp.constant(int(Status.SKY))
 ESTIMATE = wp.constant(8.0 / 1.5)
-# Of the path length: surfaces in contact that differ by less are told apart by refinement's tests of neighbours.
-DEPTH_BEND = 2.0e-4
-DEPTH_REACH = wp.constant(float(np.sqrt(8.0 * DEPTH_BEND)))
 BOUNDARY_STEPS = 12  # bisections of an edge at the hidden boundary: 1/4096 of its length, below a pixel
 
 
@@ -63,8 +60,7 @@ class VertexView:
     status: wp.array(dtype=wp.uint8)
     seed: wp.array(dtype=wp.vec3)  # what a warm start begins from; zero: nothing known
     residual: wp.array(dtype=float)
-    # Longest edges that stay whole, unit frame: for one radian of bending of the picture, and for its depth; 0: any.
-    reach: wp.array(dtype=wp.vec2)
+    reach: wp.array(dtype=float)  # edge length whose picture bends by one radian (unit frame); 0: it never bends
     position: wp.array(dtype=wp.vec3)  # eye-frame virtual vertex; length 0 where nobody reads it
 
 
@@ -97,16 +93,6 @@ def edge_reach(frame: SolveFrame, p: wp.vec3, n: wp.vec3, target: wp.vec3, curva
     c = wp.abs(wp.dot(n, to_eye)) / wp.max(d_o, 1.0e-20)
     least = c * c * (1.0 / wp.max(d_o, 1.0e-20) + 1.0 / wp.max(d_v, 1.0e-20)) + 2.0 * c * curvature
     return d_v * wp.sqrt(ESTIMATE * d_o * least)
-
-
-@wp.func
-def depth_reach(frame: SolveFrame, p: wp.vec3, target: wp.vec3) -> float:
-    """Length of a scene edge whose straight virtual picture is wrong in depth by less than DEPTH_BEND of the path.
-
-    Path length along a straight edge bends like a distance does, by h^2 / 8 over itself; minified, its virtual edge
-    hardly does.
-    """
-    return DEPTH_REACH * (wp.length(p - frame.eye) + wp.length(target - p))
 
 
 @wp.kernel
@@ -287,7 +273,9 @@ def reflect(
         layer.history = History(mesh, vertices.seed)
     with timer("virtual_raster"):
         target = raster.make_target(gbuffer.view, pixels.box, scene.device, gbuffer.reflector_id, reflector.id)
-        drawn = raster.rasterise(target, vertices.screen, mesh.triangles, threads=settings.threads)
+        if settings.refine == "exact":
+            raster.attach_rays(target, gbuffer.view, pixels, settings.threads)
+        drawn = raster.rasterise(target, vertices.screen, mesh.triangles, points=mesh.points, threads=settings.threads)
         clipped, failed = _draw_straddling(scene, mesh, target, frame, vertices, solve_boundary, gbuffer, settings)
     if settings.refine == "off":
         with timer("candidates"):
@@ -322,7 +310,7 @@ def empty_vertices(count: int, device, with_position: bool = False) -> VertexVie
     vertices.screen = wp.full(count, wp.vec4(0.0, 0.0, raster.DROPPED, 0.0), dtype=wp.vec4, device=device)
     vertices.status = wp.zeros(count, dtype=wp.uint8, device=device)
     vertices.residual = wp.zeros(count, dtype=float, device=device)
-    vertices.reach = wp.zeros(count, dtype=wp.vec2, device=device)
+    vertices.reach = wp.zeros(count, dtype=float, device=device)
     vertices.seed = wp.zeros(count, dtype=wp.vec3, device=device)
     vertices.position = wp.zeros(count if with_position else 0, dtype=wp.vec3, device=device)
     return vertices
@@ -342,7 +330,7 @@ def _cut_where_bent(
 
     def cuts_for(multiple: float) -> np.ndarray:
         cuts = virtual_mesh.needed_cuts(
-            scene, vertices, unit_per_scene, tolerance, multiple, pixels.box, settings.threads
+            scene, vertices, unit_per_scene, tolerance * multiple, pixels.box, settings.threads
         )
         cuts[part.first_triangle : part.first_triangle + part.triangle_count] = 1
         return cuts
@@ -407,6 +395,8 @@ def _draw_straddling(scene, mesh, target, frame, vertices, solve_boundary, gbuff
         wp.array(screen, dtype=wp.vec4, device=scene.device),
         wp.array(triangles, dtype=wp.vec3i, device=scene.device),
         ids=wp.array(owners, dtype=int, device=scene.device),
+        points=mesh.points,
+        plane_triangles=wp.array(mesh.host_triangles[owners], dtype=wp.vec3i, device=scene.device),
         threads=settings.threads,
     )
     return n, failed

@@ -26,7 +26,7 @@ from warp_reflect.reflector_maps import MapSample, ReflectorMap, ReflectorMapVie
 from warp_reflect.scene import PartRange, Scene
 from warp_reflect.settings import Settings, Status, Technique
 from warp_reflect.techniques import forward, grid
-from warp_reflect.techniques.forward import SolveFrame, VertexView, depth_reach, edge_reach, virtual_vertex
+from warp_reflect.techniques.forward import SolveFrame, VertexView, edge_reach, virtual_vertex
 from warp_reflect.techniques.grid import GridView, corner_weight
 
 wp.set_module_options({"enable_backward": False})
@@ -410,9 +410,7 @@ def solve_vertex(
         out_vertex.status[i] = wp.uint8(wp.where(grazing, HIDDEN, MAX_ITERATIONS))
         return
     out_vertex.status[i] = wp.uint8(CONVERGED)
-    out_vertex.reach[i] = wp.vec2(
-        edge_reach(frame, r.p, r.n, target, map.least_curvature), depth_reach(frame, r.p, target)
-    )
+    out_vertex.reach[i] = edge_reach(frame, r.p, r.n, target, map.least_curvature)
     q = virtual_vertex(frame, r.p, r.n, target)
     out_vertex.screen[i] = project(camera, q)
     if out_vertex.position.shape[0] > 0:
@@ -513,9 +511,7 @@ def grid_kernel(
                 out_vertex.seed[i] = x
                 out_vertex.residual[i] = r.residual
                 out_vertex.status[i] = wp.uint8(CONVERGED)
-                out_vertex.reach[i] = wp.vec2(
-                    edge_reach(frame, r.p, r.n, target, map.least_curvature), depth_reach(frame, r.p, target)
-                )
+                out_vertex.reach[i] = edge_reach(frame, r.p, r.n, target, map.least_curvature)
                 out_vertex.screen[i] = project(camera, virtual_vertex(frame, r.p, r.n, target))
                 return
     solve_vertex(map, frame, camera, settings, target, wp.vec3(0.0, 0.0, 0.0), i, out_vertex)

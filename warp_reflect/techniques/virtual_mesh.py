@@ -24,8 +24,8 @@ CUT_MAX = wp.constant(32)  # pieces along an edge; a lattice of 32 has 1024 tria
 CUT_SLACK = 1.5  # the tolerance is divided by it when cutting, so that a moving eye does not cut anew every frame
 BUDGET_SHARE = 2.0  # new triangles per triangle of the scene (beside BUDGET_MIN) before the tolerance is relaxed
 BUDGET_MIN = 20000
-RELAX = 4.0  # factor of the tolerance per attempt to meet the budget
-RELAX_STEPS = 12  # 4^11 times the tolerance cuts nothing any more
+RELAX = 2.0  # factor of the tolerance per attempt to meet the budget
+RELAX_STEPS = 24  # 2^23 times the tolerance cuts nothing any more
 BOX_MARGIN = wp.constant(8.0)  # pixels around a virtual triangle's straight picture that its bent one may reach
 
 
@@ -62,10 +62,9 @@ def cut_kernel(
     points: wp.array(dtype=wp.vec3),
     screen: wp.array(dtype=wp.vec4),
     status: wp.array(dtype=wp.uint8),
-    reach: wp.array(dtype=wp.vec2),
+    reach: wp.array(dtype=float),
     unit_per_scene: float,
     tolerance_root: float,
-    relaxed_root: float,
     box: wp.vec4,
     out_cut: wp.array(dtype=wp.uint8),
 ):
@@ -81,11 +80,13 @@ def cut_kernel(
     right = float(-1.0e30)
     top = float(1.0e30)
     bottom = float(-1.0e30)
+    seen_corners = int(0)
     for k in range(3):
         v = t[k]
-        if int(status[v]) == CONVERGED and reach[v][0] > 0.0:
-            shortest = wp.min(shortest, wp.min(reach[v][0] * tolerance_root, reach[v][1]) * relaxed_root)
+        if int(status[v]) == CONVERGED and reach[v] > 0.0:
+            shortest = wp.min(shortest, reach[v] * tolerance_root)
             p = screen[v]
+            seen_corners += 1
             if p[2] > 0.0:
                 left = wp.min(left, p[0])
                 right = wp.max(right, p[0])
@@ -101,23 +102,24 @@ def cut_kernel(
             and top - margin <= box[3]
         )
         if seen:
-            while pieces < CUT_MAX and longest > shortest * float(pieces):
+            # Pieces smaller than a pixel bend nothing; the picture of a partly hidden triangle may be larger than known.
+            extent = wp.max(right - left, bottom - top)
+            if seen_corners < 3:
+                extent = float(CUT_MAX)
+            while pieces < CUT_MAX and float(pieces) < extent and longest > shortest * float(pieces):
                 pieces = pieces * 2
     out_cut[i] = wp.uint8(pieces)
 
 
-def needed_cuts(
-    scene: Scene, vertices, unit_per_scene: float, tolerance: float, relaxed: float, box, threads: int
-) -> np.ndarray:
+def needed_cuts(scene: Scene, vertices, unit_per_scene: float, tolerance: float, box, threads: int) -> np.ndarray:
     """Pieces per scene triangle, uint8 [triangle_count].
 
     Args:
         tolerance: Bending of an edge's picture. [radians]
-        relaxed: Multiple of the tolerances, of the picture and of depth, that is allowed.
     """
     cut = wp.empty(scene.triangle_count, dtype=wp.uint8, device=scene.device)
     inputs = [scene.view.triangles, scene.view.points, vertices.screen, vertices.status, vertices.reach]
-    inputs += [unit_per_scene, float(np.sqrt(tolerance)), float(np.sqrt(relaxed))]
+    inputs += [unit_per_scene, float(np.sqrt(tolerance))]
     inputs += [wp.vec4(*(float(side) for side in box)), cut]
     launch(cut_kernel, scene.triangle_count, inputs, scene.device, threads)
     return cut.numpy()
