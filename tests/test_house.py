@@ -23,8 +23,8 @@ FLOORS = {
     1: "settings launch optics shapes bodies cubemap quadrics quadric_roots quadric_curve heightfield "
     "images metrics timing",
     2: "scene layers bvh raster shade surface channels stage stage.*",
-    3: "solve solver solve_device solve_plane solve_convex solve_general solve_qim mirrors reflector_maps "
-    "techniques techniques.* finishes finishes.*",
+    3: "solve solver solve_device solve_plane solve_convex solve_general solve_qim solver_gradients mirrors "
+    "reflector_maps techniques techniques.* finishes finishes.*",
     4: "planner budget frame motion sweep",
     5: "cli viewer viewer.* pipeline",
 }
@@ -128,9 +128,7 @@ def test_libraries_stay_in_their_homes(module):
     for imported in {full.partition(".")[0] for full in imported_modules(module)}:
         if imported in HOMES:
             homes = HOMES[imported]
-            assert name.partition(".")[0] in homes, (
-                f"{module} imports {imported}; its place is {homes or 'tests'}"
-            )
+            assert name.partition(".")[0] in homes, f"{module} imports {imported}; its place is {homes or 'tests'}"
 
 
 def test_import_loads_nothing_heavy():
@@ -184,9 +182,7 @@ def test_kernels_are_launched_through_launch(module):
     """`launch` cuts a launch over the CPU's threads; a bare `wp.launch` would start at no element."""
     for node in ast.walk(ast.parse(FILES[module].read_text())):
         if isinstance(node, ast.Call):
-            assert ast.unparse(node.func) not in ("wp.launch", "wp.launch_tiled"), (
-                f"{module}, line {node.lineno}"
-            )
+            assert ast.unparse(node.func) not in ("wp.launch", "wp.launch_tiled"), f"{module}, line {node.lineno}"
 
 
 @pytest.mark.parametrize("module", KERNEL_MODULES)

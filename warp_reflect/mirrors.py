@@ -50,9 +50,7 @@ class PlanarMirror:
             up = _direction(self.up, "PlanarMirror up")
         height = up - up @ normal * normal
         if np.linalg.norm(height) < 1e-9:
-            raise ValueError(
-                f"PlanarMirror up: {up.tolist()} is parallel to the normal; give another direction"
-            )
+            raise ValueError(f"PlanarMirror up: {up.tolist()} is parallel to the normal; give another direction")
         height /= np.linalg.norm(height)
         put("height_axis", height)
         put("width_axis", np.cross(height, normal))
@@ -60,10 +58,17 @@ class PlanarMirror:
             extent = np.asarray(self.extent, np.float64)
             if extent.shape != (2,) or not np.isfinite(extent).all() or not (extent > 0.0).all():
                 raise ValueError(
-                    f"PlanarMirror extent: got {self.extent!r}, "
-                    "expected (half width, half height), both positive"
+                    f"PlanarMirror extent: got {self.extent!r}, expected (half width, half height), both positive"
                 )
             put("extent", (float(extent[0]), float(extent[1])))
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """The plane as a quadric without curvature, float64 [4, 4]: 2 normal.(x - point), negative behind it."""
+        q = np.zeros((4, 4))
+        q[:3, 3] = q[3, :3] = self.normal
+        q[3, 3] = -2.0 * self.normal @ self.point
+        return q
 
 
 @dataclass(frozen=True)
@@ -160,19 +165,13 @@ class QuadricMirror:
         name = f"QuadricMirror.rotational A={A}, B={B}, C={C}"
         world = np.eye(4) if world_from_object is None else np.asarray(world_from_object, np.float64)
         if world.shape != (4, 4) or not np.isfinite(world).all():
-            raise ValueError(
-                f"{name}: world_from_object must be a finite [4, 4] matrix, got shape {world.shape}"
-            )
+            raise ValueError(f"{name}: world_from_object must be a finite [4, 4] matrix, got shape {world.shape}")
         if not np.allclose(world[3], [0.0, 0.0, 0.0, 1.0], rtol=0.0, atol=1e-12):
-            raise ValueError(
-                f"{name}: world_from_object must have the last row 0 0 0 1, got {world[3].tolist()}"
-            )
+            raise ValueError(f"{name}: world_from_object must have the last row 0 0 0 1, got {world[3].tolist()}")
         linear = world[:3, :3]
         scale = np.abs(linear).max()
         if not scale > 0.0 or abs(np.linalg.det(linear / scale)) < 1e-12:
-            raise ValueError(
-                f"{name}: world_from_object is not invertible; give every axis a scale other than 0"
-            )
+            raise ValueError(f"{name}: world_from_object is not invertible; give every axis a scale other than 0")
         back = np.linalg.inv(linear)
         a = back.T @ np.diag([1.0, 1.0, float(A)]) @ back
         b = back.T @ np.array([0.0, 0.0, 0.5 * float(B)])

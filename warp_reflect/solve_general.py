@@ -6,7 +6,7 @@ from typing import Any
 
 import warp as wp
 
-from warp_reflect.quadric_roots import FLAG_RING, all_reflections, flatness
+from warp_reflect.quadric_roots import FLAG_RING, all_reflections, flatness, polish_root
 from warp_reflect.quadrics import unit_roundoff
 from warp_reflect.solve_device import (
     AMBIGUOUS,
@@ -35,12 +35,16 @@ from warp_reflect.solve_device import (
 # Unrolled, the searches in loops of known length would be compiled many times over.
 wp.set_module_options({"enable_backward": False, "max_unroll": 2})
 
+FOLLOW_FLAT = wp.constant(wp.float64(4.0e-3))  # a flatter start is near a caustic: all roots are looked at
+
 
 @wp.kernel
 def solve_general_kernel(
     first: int,
     eyes: wp.array(dtype=wp.vec3d),
     points: wp.array(dtype=Any),
+    start: wp.array(dtype=Any),
+    warm: int,
     view: QuadricView,
     # Outputs:
     out_point: wp.array(dtype=Any),
@@ -96,7 +100,22 @@ def solve_general_kernel(
             count = 1
         else:
             best = Found()
-    found, root_count = all_reflections(cut_far(eye, far), cut_far(target, far), a, b, c, view.equal, view.sheet)
+    e = cut_far(eye, far)
+    t = cut_far(target, far)
+    if warm != 0 and count == 0:
+        s = view.unit_from_world * (to_double(start[row]) - view.origin)
+        if finite(s):
+            near = polish_root(s, e, t, a, b, c)
+            there = view.sheet == 0 or near.point[2] * wp.float64(view.sheet) > wp.float64(0.0)
+            # Index 0 is what is wanted: the branch of the start is followed, no scan.
+            if near.valid != 0 and near.index == 0 and there and near.flat > FOLLOW_FLAT:
+                best = judge(near.point, eye, target, a, b, roundoff, grazing_limit(zero[0]))
+                if best.status == CONVERGED:
+                    out_status[row] = wp.uint8(CONVERGED)
+                    write_answer(zero, best, view, row, out_point, out_normal, out_virtual, out_residual)
+                    return
+                best = Found()
+    found, root_count = all_reflections(e, t, a, b, c, view.equal, view.sheet)
     for k in range(root_count):
         code = int(found[k, 4])
         ring = code & FLAG_RING
@@ -148,6 +167,7 @@ for _vector, _scalar in ((wp.vec3, wp.float32), (wp.vec3d, wp.float64)):
         solve_general_kernel,
         {
             "points": wp.array(dtype=_vector),
+            "start": wp.array(dtype=_vector),
             "out_roots": wp.array2d(dtype=_vector),
             "out_root_length": wp.array2d(dtype=_scalar),
             "out_point": wp.array(dtype=_vector),

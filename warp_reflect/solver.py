@@ -153,8 +153,9 @@ def solve(
             float32 out.
         all_roots: Also give every reflection point. Without, the one with Morse index 0, else the shortest of
             index 2, else of index 1.
-        start: An earlier solution for as many eyes and points: a near start saves more than half of the
-            time on convex quadrics and changes nothing but rounding. Ignored where several roots compete.
+        start: An earlier solution for as many eyes and points, for speed. On convex mirrors it changes nothing
+            but rounding. Where several roots compete, a start whose root has index 0 is followed even if
+            another root of index 0 has become shorter; not used with all_roots.
         method: "newton", or "qim" for the search of Lages Miguel et al. 2014 (convex surfaces of revolution).
         device: Warp device for arrays of the host; None: Warp's current one. Device arrays stay where they
             are.
@@ -332,12 +333,9 @@ def _(mirror: QuadricMirror, request: Request) -> Answer:
             )
         launch(solve_qim_kernel, request.count, [request.eyes, request.points, view, *outputs[:5]], device, threads)
         return answer
-    if mirror.convex:
-        warm = request.start is not None
-        start = request.start if warm else request.points
-        inputs = [request.eyes, request.points, start, int(warm), view, *outputs]
-        launch(solve_convex_kernel, request.count, inputs, device, threads)
-    else:
-        inputs = [request.eyes, request.points, view, *outputs]
-        launch(solve_general_kernel, request.count, inputs, device, threads)
+    warm = request.start is not None and not (request.all_roots and not mirror.convex)
+    start = request.start if warm else request.points
+    inputs = [request.eyes, request.points, start, int(warm), view, *outputs]
+    kernel = solve_convex_kernel if mirror.convex else solve_general_kernel
+    launch(kernel, request.count, inputs, device, threads)
     return answer
