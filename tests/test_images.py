@@ -146,9 +146,7 @@ def test_acescg_is_converted_to_rec709(tmp_path):
     pixels = np.broadcast_to([0.4, 0.3, 0.2], (3, 3, 3))
     path = save(tmp_path / "a.exr", ["R", "G", "B"], pixels, chromaticities=ap1)
     # The published matrix of ACEScg (S-2014-004) to Rec.709 with Bradford adaptation.
-    published = np.array(
-        [[1.70505, -0.62179, -0.08326], [-0.13026, 1.14080, -0.01055], [-0.02400, -0.12897, 1.15297]]
-    )
+    published = np.array([[1.70505, -0.62179, -0.08326], [-0.13026, 1.14080, -0.01055], [-0.02400, -0.12897, 1.15297]])
     assert np.allclose(images.read_image(path).rgb[1, 1], published @ [0.4, 0.3, 0.2], atol=1e-4)
     assert np.allclose(images.read_image(path, "raw").rgb[1, 1], [0.4, 0.3, 0.2], atol=1e-6)
 

@@ -177,7 +177,11 @@ def test_mask_and_box_limit_the_drawing():
     mask = np.zeros((16, 16), np.int32)
     mask[4:8, 4:12] = 3
     ids, _ = draw(
-        flat([[[-40, -40], [80, -40], [-40, 80]]]), 16, 16, box=(2, 3, 14, 10),
-        mask=wp.array(mask.reshape(-1), dtype=int, device="cpu"), mask_value=3,
+        flat([[[-40, -40], [80, -40], [-40, 80]]]),
+        16,
+        16,
+        box=(2, 3, 14, 10),
+        mask=wp.array(mask.reshape(-1), dtype=int, device="cpu"),
+        mask_value=3,
     )
     assert ((ids == 0) == (mask[3:10, 2:14] == 3)).all()

@@ -105,9 +105,7 @@ def brute_force(points, triangles, origins, directions):
     weights = np.zeros((len(origins), 3))
     margin = np.full(len(origins), np.inf)
     with np.errstate(divide="ignore", invalid="ignore"):
-        for i, (o, d) in enumerate(
-            zip(origins.astype(np.float64), directions.astype(np.float64), strict=True)
-        ):
+        for i, (o, d) in enumerate(zip(origins.astype(np.float64), directions.astype(np.float64), strict=True)):
             t = np.einsum("ij,ij->i", v0 - o, n) / (n @ d)
             p = o + t[:, None] * d
             area = np.einsum("ij,ij->i", n, n)
@@ -167,10 +165,7 @@ def intersect_kernel(
 
 
 def intersect(origin, direction, a, b, c):
-    arrays = [
-        wp.array(np.asarray(x, np.float32), dtype=wp.vec3, device=DEVICE)
-        for x in (origin, direction, a, b, c)
-    ]
+    arrays = [wp.array(np.asarray(x, np.float32), dtype=wp.vec3, device=DEVICE) for x in (origin, direction, a, b, c)]
     n = len(origin)
     hit = wp.zeros(n, dtype=int, device=DEVICE)
     t = wp.zeros(n, dtype=float, device=DEVICE)
@@ -237,16 +232,11 @@ def test_intersect_triangle_never_leaks_at_a_shared_edge(offset):
 
 def test_unit_and_facet_normal_hold_at_every_scale():
     for scale in (1e-30, 1e-20, 1e-12, 1.0, 1e12, 1e20, 1e30):
-        np.testing.assert_allclose(
-            unit(wp.vec3(2 * scale, 0.0, -scale)), np.array([2, 0, -1]) / np.sqrt(5), rtol=1e-6
-        )
+        np.testing.assert_allclose(unit(wp.vec3(2 * scale, 0.0, -scale)), np.array([2, 0, -1]) / np.sqrt(5), rtol=1e-6)
         n = facet_normal(wp.vec3(0.0, 0.0, 0.0), wp.vec3(scale, 0.0, 0.0), wp.vec3(0.0, scale, scale))
         np.testing.assert_allclose(n, np.array([0, -1, 1]) / np.sqrt(2), atol=1e-6)
     assert list(unit(wp.vec3(0.0, 0.0, 0.0))) == [0.0, 0.0, 0.0]
-    assert (
-        list(facet_normal(wp.vec3(1.0, 1.0, 1.0), wp.vec3(2.0, 2.0, 2.0), wp.vec3(3.0, 3.0, 3.0)))
-        == [0.0] * 3
-    )
+    assert list(facet_normal(wp.vec3(1.0, 1.0, 1.0), wp.vec3(2.0, 2.0, 2.0), wp.vec3(3.0, 3.0, 3.0))) == [0.0] * 3
 
 
 # The tracer.
@@ -285,9 +275,7 @@ def test_trace_matches_embree(threads):
     ball = trimesh.creation.icosphere(4, radius=0.6)
     torus = trimesh.creation.torus(1.0, 0.3)
     room = trimesh.creation.box((6, 6, 6))
-    scene = scene_of(
-        *((mesh_of(m.vertices, m.faces), place(x)) for x, m in ((0.5, ball), (-0.7, torus), (0, room)))
-    )
+    scene = scene_of(*((mesh_of(m.vertices, m.faces), place(x)) for x, m in ((0.5, ball), (-0.7, torus), (0, room))))
     origins, directions = random_rays(rng, 20_000, 0.0, 2.5)
     embree = rtcore_scene.EmbreeScene()
     TriangleMesh(embree, scene.host_points, scene.host_triangles)
@@ -465,9 +453,7 @@ def test_mirror_pixels_interpolate_the_normals_of_a_mesh():
     area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
     weights = np.stack(
         [
-            np.einsum(
-                "ij,ij->i", np.cross(corner[:, k - 1] - corner[:, k - 2], on_plane - corner[:, k - 2]), flat
-            )
+            np.einsum("ij,ij->i", np.cross(corner[:, k - 1] - corner[:, k - 2], on_plane - corner[:, k - 2]), flat)
             for k in range(3)
         ],
         axis=1,
@@ -526,9 +512,7 @@ def test_mirror_pixels_split_the_picture_by_part():
 
 def test_surface_channels_give_depth_normal_and_prim():
     box = trimesh.creation.box((2, 2, 2))
-    scene = scene_of(
-        (mesh_of(box.vertices, box.faces), place(1e6, 0, 0)), (mesh_of(box.vertices, box.faces), place())
-    )
+    scene = scene_of((mesh_of(box.vertices, box.faces), place(1e6, 0, 0)), (mesh_of(box.vertices, box.faces), place()))
     camera = look_at((1e6 + 3, 2.5, 4), (1e6, 0, 0))
     gbuffer = raster.draw_scene(scene, camera)
     channels = surface.surface_channels(scene, gbuffer)

@@ -161,7 +161,7 @@ def test_eye_and_target_exchange_without_moving_the_point():
 
 
 def test_search_never_answers_nan():
-    axes, drawn = draw((1, 1, 0.2), 64)
+    _, drawn = draw((1, 1, 0.2), 64)
     rng = np.random.default_rng(6)
     scale = 10.0 ** rng.uniform(-8, 8, (2, 20000, 1))
     eye, target = rng.normal(size=(2, 20000, 3)) * scale

@@ -39,9 +39,7 @@ def place(x=0.0, y=0.0, z=0.0, scale=1.0) -> np.ndarray:
 
 
 def dome(color=(1.0, 1.0, 1.0), texture=None, world_from_light=None) -> LightData:
-    return LightData(
-        "/dome", "dome", color, np.eye(4) if world_from_light is None else world_from_light, texture
-    )
+    return LightData("/dome", "dome", color, np.eye(4) if world_from_light is None else world_from_light, texture)
 
 
 def distant(color, to_light) -> LightData:
@@ -109,9 +107,7 @@ def picture_of(scene, camera, mirrors=(), threads=0):
     parts = {part + 1: part for part in mirrors}
     pixels, gbuffer.reflector_id = surface.mirror_pixels(scene, gbuffer, parts)
     layers = {
-        k: raytraced.reflect(
-            scene, raytraced.Prepared(parts[k], True), gbuffer, pixels[k], camera, Settings()
-        )
+        k: raytraced.reflect(scene, raytraced.Prepared(parts[k], True), gbuffer, pixels[k], camera, Settings())
         for k in parts
     }
     picture, mirror = shade.shade(scene, gbuffer, layers, threads)
@@ -177,9 +173,7 @@ def test_distant_light_follows_the_cosine():
     rgba, _, triangle, normal = picture_of(scene, look_at((5.5, 1, 3), (5, 0, 0)))
     seen = triangle >= 0
     cosine = np.maximum(normal[seen] @ to_light, 0.0)
-    want = (
-        np.array([0.01, 0.02, 0.03]) + cosine[:, None] * np.array([3.0, 2.0, 1.0]) * [0.8, 0.5, 0.25] / np.pi
-    )
+    want = np.array([0.01, 0.02, 0.03]) + cosine[:, None] * np.array([3.0, 2.0, 1.0]) * [0.8, 0.5, 0.25] / np.pi
     assert (cosine > 0.1).sum() > 100 and (cosine == 0).sum() > 20
     np.testing.assert_allclose(rgba[seen, :3], want, atol=2e-6)
     assert not rgba[~seen].any()  # no dome: black, without coverage
@@ -224,9 +218,7 @@ def test_latlong_corners_follow_openexr():
 def test_irradiance_of_a_textured_dome_is_its_integral():
     def radiance(d):  # second order: nine coefficients hold it exactly
         x, y, z = d[..., 0], d[..., 1], d[..., 2]
-        return np.stack(
-            [1 + x * y - 0.4 * z, 1.2 + y * y - 0.8 * x * z, 1.2 + 0.5 * x + y * z - z * z], axis=-1
-        )
+        return np.stack([1 + x * y - 0.4 * z, 1.2 + y * y - 0.8 * x * z, 1.2 + 0.5 * x + y * z - z * z], axis=-1)
 
     rng = np.random.default_rng(0)
     world_from_light = turn([3, -1, 2], 0.8)
@@ -262,9 +254,7 @@ MIRRORS = {
     "metal": MaterialData(base_color=(0.9, 0.6, 0.3), metallic=1.0, roughness=0.0),
     "glass": MaterialData(base_color=(0.1, 0.3, 0.2), ior=1.5, roughness=0.0),
     "half": MaterialData(base_color=(0.4, 0.5, 0.6), metallic=0.5, roughness=0.05),
-    "specular": MaterialData(
-        base_color=(0.2, 0.2, 0.2), specular_workflow=True, specular_color=(0.3, 0.5, 0.7)
-    ),
+    "specular": MaterialData(base_color=(0.2, 0.2, 0.2), specular_workflow=True, specular_color=(0.3, 0.5, 0.7)),
     "coat": MaterialData(base_color=(0.9, 0.1, 0.1), roughness=0.0, clearcoat=1.0, ior=1.6),
 }
 
@@ -304,9 +294,7 @@ def test_a_mirror_seen_in_a_mirror_shows_base_and_dome():
     sky = np.array([0.2, 0.4, 0.8])
     coated = MaterialData(base_color=(0.5, 0.3, 0.1), metallic=1.0, roughness=0.0)
     silver = MaterialData(base_color=(1, 1, 1), metallic=1.0, roughness=0.0)
-    scene = scene_of(
-        [(ball_mesh(), place(), silver), (ball_mesh(), place(0, 0, 6, 3.5), coated)], [dome(tuple(sky))]
-    )
+    scene = scene_of([(ball_mesh(), place(), silver), (ball_mesh(), place(0, 0, 6, 3.5), coated)], [dome(tuple(sky))])
     camera = look_at((0, 2.5, 1.2), (0, 0, 0), fov=60)
     gbuffer = raster.draw_scene(scene, camera)
     pixels, gbuffer.reflector_id = surface.mirror_pixels(scene, gbuffer, {1: 0})
@@ -316,10 +304,7 @@ def test_a_mirror_seen_in_a_mirror_shows_base_and_dome():
     assert hit.sum() > 100 and (~hit).sum() > 100
     np.testing.assert_allclose(mirror[~hit], np.tile(sky, ((~hit).sum(), 1)), atol=1e-6)
     # The angle at the second mirror, from the ball's own geometry.
-    p = (
-        layer.pixels.point.numpy()
-        + layer.distance.numpy()[:, None].astype(float) * layer.pixels.direction.numpy()
-    )
+    p = layer.pixels.point.numpy() + layer.distance.numpy()[:, None].astype(float) * layer.pixels.direction.numpy()
     n = p[hit] + scene.origin - [0, 0, 6]
     n /= np.linalg.norm(n, axis=1, keepdims=True)
     cosine = np.abs(np.einsum("ij,ij->i", n, layer.pixels.direction.numpy()[hit]))

@@ -210,14 +210,19 @@ def commit() -> str:
 def table(rows: list[dict]) -> None:
     """Print the rows for a reader."""
     first = rows[0]
-    print(f"{first['machine']}; warp {first['warp']}; {first['threads']} thread(s); {first['size'][0]}x{first['size'][1]}")
-    header = f"{'stage':14s} {'contender':10s} {'reflect ms':>10s} {'p95':>7s} {'x ref':>6s} {'frame ms':>9s} {'identical':>10s}"
+    print(
+        f"{first['machine']}; warp {first['warp']}; {first['threads']} thread(s); {first['size'][0]}x{first['size'][1]}"
+    )
+    header = f"{'stage':14s} {'contender':10s} {'reflect ms':>10s} {'p95':>7s} {'x ref':>6s} "
+    header += f"{'frame ms':>9s} {'identical':>10s}"
     print(header + "  steps (ms)")
     for row in rows:
         reference = next(r for r in rows if r["stage"] == row["stage"] and r["contender"] == "reference")
         ratio = reference["reflect_ms"] / max(row["reflect_ms"], 1e-9)
         frame = f"{row['frame_ms']:9.1f}" if row["frame_ms"] is not None else " " * 9
-        steps = ", ".join(f"{step.split('/')[-1]} {ms:.1f}" for step, ms in row["steps_ms"].items() if step != "reflect")
+        steps = ", ".join(
+            f"{step.split('/')[-1]} {ms:.1f}" for step, ms in row["steps_ms"].items() if step != "reflect"
+        )
         print(
             f"{row['stage']:14s} {row['contender']:10s} {row['reflect_ms']:10.1f} {row['reflect_p95_ms']:7.1f} "
             f"{ratio:6.2f} {frame} {100 * row['identical']:9.4f}%  {steps}"

@@ -104,9 +104,7 @@ class Writer:
         middle = np.add(bottom, (0, 0.5 * height, 0))
         return self._gprim(prim, middle, (0, 0, 0), None, look)
 
-    def capsule(
-        self, path: str, middle, radius: float, height: float, look: str, rotate=(0, 0, 0)
-    ) -> UsdGeom.Capsule:
+    def capsule(self, path: str, middle, radius: float, height: float, look: str, rotate=(0, 0, 0)) -> UsdGeom.Capsule:
         prim = UsdGeom.Capsule.Define(self.stage, path)
         prim.CreateAxisAttr(UsdGeom.Tokens.y)
         prim.CreateRadiusAttr(radius)
@@ -159,9 +157,7 @@ class Writer:
         aperture = 0.36  # tenths of a metre: a 36 mm wide film gate
         prim.CreateHorizontalApertureAttr(aperture)
         prim.CreateVerticalApertureAttr(aperture * 9 / 16)
-        prim.CreateFocalLengthAttr(
-            round(0.5 * aperture * 9 / 16 / math.tan(math.radians(vertical_fov) / 2), 4)
-        )
+        prim.CreateFocalLengthAttr(round(0.5 * aperture * 9 / 16 / math.tan(math.radians(vertical_fov) / 2), 4))
         prim.CreateClippingRangeAttr(Gf.Vec2f(0.01, 100.0))
         view = np.asarray(target, float) - np.asarray(eye, float)
         pitch = math.degrees(math.atan2(view[1], math.hypot(view[0], view[2])))
@@ -298,8 +294,7 @@ def _kitchen_shell(w: Writer) -> None:
         x, z = _corner(-m, -m, turn)
         w.part(f"/World/Shell/{name}Tiles", "wall_ochre", (x, 0, z), (0, turn, 0))
     back = [
-        sheet((-m, y, -m), (2 * m, 0, 0), (0, h, 0), d.count(7), d.count(n))
-        for y, h, n in ((0, 0.9, 2), (2.1, 0.5, 1))
+        sheet((-m, y, -m), (2 * m, 0, 0), (0, h, 0), d.count(7), d.count(n)) for y, h, n in ((0, 0.9, 2), (2.1, 0.5, 1))
     ]
     back += [sheet((x, 1.5, -m), (1.2, 0, 0), (0, 0.6, 0), d.count(3), d.count(2)) for x in (-m, 0.9)]
     w.mesh("/World/Shell/BackWall", merge(*back), "Plaster")
@@ -329,9 +324,7 @@ def _kitchen_window(w: Writer) -> None:
     sky = sheet((-0.9, 1.36, z - 0.06), (1.8, 0, 0), (0, 0.74, 0), d.count(6), d.count(3))
     w.mesh("/World/Window/Sky", sky, "Daylight")
     u = np.linspace(0, 1, d.count(12) + 1)
-    hills = np.stack(
-        [1.8 * u - 0.9, 1.44 + 0.035 * np.sin(8 * u) + 0.02 * np.sin(19 * u + 1), 0 * u + z - 0.055], -1
-    )
+    hills = np.stack([1.8 * u - 0.9, 1.44 + 0.035 * np.sin(8 * u) + 0.02 * np.sin(19 * u + 1), 0 * u + z - 0.055], -1)
     w.mesh("/World/Window/Meadow", patch(np.stack([hills * (1, 0, 1) + (0, 1.2, 0), hills], 1)), "Meadow")
     for k, x in enumerate((-0.9, -0.3, 0.3, 0.9)):
         w.cube(f"/World/Window/Mullion{k}", (x, 1.2, z), (0.05, 0.9, 0.09), "White")
@@ -346,9 +339,7 @@ def _kitchen_furniture(w: Writer) -> None:
     d, m = w.detail, ROOM
     for k in range(7):
         w.part(f"/World/Units/Base{k}", "base_unit", (-m + 0.6 * k, 0, -m))
-    w.mesh(
-        "/World/Units/Top", block((2 * m, 0.035, 0.62), d, 0.006, 0.6).moved((0, 0.88, -m + 0.31)), "PaleWood"
-    )
+    w.mesh("/World/Units/Top", block((2 * m, 0.035, 0.62), d, 0.006, 0.6).moved((0, 0.88, -m + 0.31)), "PaleWood")
     for k, x in enumerate((-m, -m + 0.6, 0.9, 1.5)):
         w.part(f"/World/Units/Wall{k}", "wall_unit", (x, 1.5, -m))
     # Right wall: a second run of units under a shelf.
@@ -579,9 +570,7 @@ CHECKER = ((0.75, 0.73, 0.7), (0.06, 0.09, 0.12))
 
 def _arena(w: Writer, half: float, cells: int) -> None:
     """A checker floor and, around scene and eye, a ring of pillars: else mirrors would show empty sky."""
-    floor = checked_sheet(
-        (-half, 0, half), (2 * half, 0, 0), (0, 0, -2 * half), cells, cells, CHECKER, w.detail
-    )
+    floor = checked_sheet((-half, 0, half), (2 * half, 0, 0), (0, 0, -2 * half), cells, cells, CHECKER, w.detail)
     w.mesh("/World/Floor", floor)
     looks = (
         "Red",
@@ -723,9 +712,7 @@ SCENES = {
         "Chrome mesh, sphere and ellipsoid on a laid kitchen table; after Estalella et al. 2005, figure 6",
         ("/World/Kettle/Body", "/World/ChromeSphere", "/World/ChromeEllipsoid"),
     ),
-    "one_mirror": Recipe(
-        _one_mirror, "One ellipsoid over half of the picture in a toy room", ("/World/Mirror",)
-    ),
+    "one_mirror": Recipe(_one_mirror, "One ellipsoid over half of the picture in a toy room", ("/World/Mirror",)),
     "sphere_on_checker": Recipe(_sphere_on_checker, "A sphere over a checker floor", ("/World/Mirror",)),
     "ellipsoid_row": Recipe(
         _ellipsoid_row,
@@ -785,9 +772,7 @@ def main() -> int:
     parser.add_argument("--out", default=Path(__file__).resolve().parent.parent / "usd_scenes", type=Path)
     parser.add_argument("--only", action="append", choices=sorted(SCENES), help="this scene; may be repeated")
     parser.add_argument("--scale", default=1.0, type=float, help="multiplies the segments of every mesh")
-    parser.add_argument(
-        "--large", type=Path, help="also write million-triangle .usdc versions into this folder"
-    )
+    parser.add_argument("--large", type=Path, help="also write million-triangle .usdc versions into this folder")
     args = parser.parse_args()
     jobs = [(name, args.out / f"{name}.usda", args.scale) for name in args.only or SCENES]
     if args.large:

@@ -185,9 +185,7 @@ def _cup(d: Detail) -> Pieces:
 def _bottle(d: Detail) -> Pieces:
     """A bottle whose glass takes the look bound to it."""
     foot = [(0, 0.003), (0.031, 0.0005), (0.0365, 0.006), (0.037, 0.04)]
-    glass = turned(
-        [*foot, (0.037, 0.15), (0.032, 0.18), (0.02, 0.205), (0.0145, 0.225), (0.0138, 0.262)], d, 14
-    )
+    glass = turned([*foot, (0.037, 0.15), (0.032, 0.18), (0.02, 0.205), (0.0145, 0.225), (0.0138, 0.262)], d, 14)
     label = turned([(0.0375, 0.04), (0.0375, 0.125)], d, 14)
     cap = turned([(0.0138, 0.258), (0.0158, 0.26), (0.0158, 0.298), (0.0145, 0.303), (0, 0.304)], d, 10)
     return [("Glass", glass, None), ("Label", label, "Cream"), ("Cap", cap, "Coral")]
@@ -203,9 +201,7 @@ def _pot(d: Detail) -> Pieces:
     body = [(0, 0.001), (0.1, 0), (0.108, 0.008), (0.11, 0.12), (0.116, 0.124), (0.11, 0.129), (0.06, 0.142)]
     body += [(0.014, 0.147), (0.012, 0.155), (0.02, 0.167), (0.012, 0.176), (0, 0.178)]
     n = d.count(4)
-    grip = sweep(arc((0.108, 0, 0), 0.028, -90, 90, n), np.full(n + 1, 0.005), d, 5).moved(
-        (0, 0.1, 0), (90, 0, 0)
-    )
+    grip = sweep(arc((0.108, 0, 0), 0.028, -90, 90, n), np.full(n + 1, 0.005), d, 5).moved((0, 0.1, 0), (90, 0, 0))
     return [
         ("Body", turned(body, d, 14), "Crimson"),
         ("Grips", merge(grip, grip.moved(rotate=(0, 180, 0))), "Black"),
@@ -230,9 +226,7 @@ def _plant(d: Detail) -> Pieces:
         lift, reach = 0.12 + 0.12 * (k % 5) / 4, 0.07 + 0.006 * (k % 7)
         spine = np.concatenate([reach * u, lift * u - 0.07 * u**3, 0 * u], 1)
         width = 0.026 * np.sin(math.pi * np.clip(u, 0.02, 0.985) ** 0.8)
-        net = np.stack(
-            [spine + width * (0, 0, 1), spine + width * (0, -0.25, 0), spine - width * (0, 0, 1)], axis=1
-        )
+        net = np.stack([spine + width * (0, 0, 1), spine + width * (0, -0.25, 0), spine - width * (0, 0, 1)], axis=1)
         leaves.append(smooth(patch(net)).moved((0, 0.098, 0), (0, k * golden, 0)))
     return [("Pot", turned(pot, d, 12), "Terracotta"), ("Leaves", merge(*leaves), "Leaf")]
 
@@ -240,9 +234,7 @@ def _plant(d: Detail) -> Pieces:
 def _ladle(d: Detail) -> Pieces:
     """A ladle hanging from the origin."""
     n = d.count(5)
-    handle = np.concatenate(
-        [np.linspace((0, -0.22, 0), (0, -0.03, 0), 2), arc((0.012, -0.012, 0), 0.012, 180, 20, n)]
-    )
+    handle = np.concatenate([np.linspace((0, -0.22, 0), (0, -0.03, 0), 2), arc((0.012, -0.012, 0), 0.012, 180, 20, n)])
     shell = [
         (0, -0.03),
         (0.02, -0.026),
@@ -330,9 +322,7 @@ def _clock(d: Detail) -> Pieces:
     """A wall clock about the origin, facing +z."""
     profile = [(0.17, 0), (0.166, 0.02), (0.15, 0.022), (0.148, 0.004), (0, 0.004)]
     face = turned(profile, d, 20, (NAVY, WHITE), (0, 0, 0, 1)).moved(rotate=(90, 0, 0))
-    strokes = [
-        block((0.008, 0.03, 0.004), d).moved((0, 0.1, 0.007)).moved(rotate=(0, 0, 90 * k)) for k in range(4)
-    ]
+    strokes = [block((0.008, 0.03, 0.004), d).moved((0, 0.1, 0.007)).moved(rotate=(0, 0, 90 * k)) for k in range(4)]
     for length, angle in ((0.09, 52), (0.12, -63)):
         strokes.append(block((0.008, length, 0.003), d).moved((0, -0.015, 0.012)).moved(rotate=(0, 0, angle)))
     return [("Face", face, None), ("Hands", merge(*strokes), "Black")]
@@ -408,9 +398,7 @@ def _mat_tiles(d: Detail) -> Pieces:
 # The kettle
 
 KETTLE = Egg(0.168, 0.132, -0.0062)
-KETTLE_GAP = (
-    0.002  # what stands around the body keeps this off it, so that nothing touches or enters the mirror [m]
-)
+KETTLE_GAP = 0.002  # what stands around the body keeps this off it, so that nothing touches or enters the mirror [m]
 FOOT_BEAD = 0.008
 
 

@@ -46,9 +46,7 @@ class Surface:
         normals = self.normals
         if normals is not None:
             normals = unit((normals / stretch) @ turn.T)
-        return replace(
-            self, points=(self.points * stretch) @ turn.T + np.asarray(translate, float), normals=normals
-        )
+        return replace(self, points=(self.points * stretch) @ turn.T + np.asarray(translate, float), normals=normals)
 
     def painted(self, palette, color_index) -> Surface:
         return replace(self, palette=tuple(palette), color_index=np.asarray(color_index, int))
@@ -97,9 +95,7 @@ def weld(surface: Surface) -> Surface:
     order = np.argsort(first)  # keeps the points in the order of their first use
     place = np.empty(len(order), int)
     place[order] = np.arange(len(order))
-    return replace(
-        surface, points=surface.points[first[order]], indices=place[number.reshape(-1)[surface.indices]]
-    )
+    return replace(surface, points=surface.points[first[order]], indices=place[number.reshape(-1)[surface.indices]])
 
 
 def smooth(surface: Surface) -> Surface:
@@ -172,9 +168,7 @@ def turned(profile, detail: Detail, segments: int, palette=(), spans=()) -> Surf
     pieces = detail.count(1)
     t = np.linspace(0, len(p) - 1, (len(p) - 1) * pieces + 1)
     around = detail.count(segments)
-    surface = revolve(
-        np.interp(t, np.arange(len(p)), p[:, 0]), np.interp(t, np.arange(len(p)), p[:, 1]), around
-    )
+    surface = revolve(np.interp(t, np.arange(len(p)), p[:, 0]), np.interp(t, np.arange(len(p)), p[:, 1]), around)
     return surface.painted(palette, np.repeat(spans, pieces * around)) if len(spans) else surface
 
 
@@ -185,9 +179,7 @@ def ball(radius: float, detail: Detail, segments: int, rings: int) -> Surface:
     return revolve(radius * r, radius * y, detail.count(segments), np.stack([r, y], 1))
 
 
-def torus(
-    ring: float, bead: float, detail: Detail, segments: int, sides: int, turn: float = 360.0
-) -> Surface:
+def torus(ring: float, bead: float, detail: Detail, segments: int, sides: int, turn: float = 360.0) -> Surface:
     """A torus about +Y; `turn` below 360 [degrees] leaves an open arc without caps."""
     whole = turn >= 360.0
     n, m = detail.count(segments), detail.count(sides)

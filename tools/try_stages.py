@@ -21,10 +21,7 @@ def main() -> int:
     parser.add_argument("folder", type=Path, nargs="+")
     parser.add_argument("--notes", action="store_true", help="print every note below its stage")
     arguments = parser.parse_args()
-    print(
-        f"{'triangles':>10} {'inst':>6} {'mat':>4} {'lights':>6} {'cams':>4} {'s':>6} {'MB':>6} "
-        f"{'notes':>5}  stage"
-    )
+    print(f"{'triangles':>10} {'inst':>6} {'mat':>4} {'lights':>6} {'cams':>4} {'s':>6} {'MB':>6} {'notes':>5}  stage")
     failed = 0
     for folder in arguments.folder:
         files = [folder] if folder.is_file() else sorted(p for p in folder.rglob("*") if p.suffix in SUFFIXES)

@@ -143,9 +143,7 @@ class Frame:
         return reflection_channels(self.scene, self.gbuffer, self.layers, self.plan.settings.threads)
 
 
-def render_frame(
-    scene: Scene, plan: Plan, camera: str | Camera | None = None, previous: Frame | None = None
-) -> Frame:
+def render_frame(scene: Scene, plan: Plan, camera: str | Camera | None = None, previous: Frame | None = None) -> Frame:
     """Render a scene as planned.
 
     Args:

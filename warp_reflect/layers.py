@@ -68,8 +68,9 @@ class Camera:
 
     @classmethod
     def from_data(cls, data: CameraData, size: tuple[int, int]) -> Camera:
-        """Film-back geometry of a UsdGeomCamera at an image size; pixels are square (the aperture is widened to fit,
-        UsdRender's `expandAperture`).
+        """Film-back geometry of a UsdGeomCamera at an image size.
+
+        Pixels are square: the aperture is widened to fit (UsdRender's `expandAperture`).
         """
         width, height = size
         columns = data.world_from_camera[:3, :3].astype(np.float64)
@@ -117,9 +118,7 @@ class Camera:
             view.x_row = wp.vec4(*(x + self.cx * self.forward), 0.0)
             view.y_row = wp.vec4(*(y + self.cy * self.forward), 0.0)
             view.w_row = wp.vec4(*self.forward, 0.0)
-            view.ray_corner = wp.vec3(
-                *(self.forward - self.cx / self.fx * self.right + self.cy / self.fy * self.up)
-            )
+            view.ray_corner = wp.vec3(*(self.forward - self.cx / self.fx * self.right + self.cy / self.fy * self.up))
         view.ray_dx = wp.vec3(*(self.right / self.fx))
         view.ray_dy = wp.vec3(*(-self.up / self.fy))
         view.orthographic = int(self.orthographic)

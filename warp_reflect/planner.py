@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from warp_reflect import __version__, budget, raster, surface
+from warp_reflect import __version__, budget, raster
 from warp_reflect.layers import Camera, Reflector
 from warp_reflect.scene import Note, PartRange, Scene, reflectance
 from warp_reflect.settings import Settings
@@ -67,7 +67,7 @@ class Plan:
 
     @property
     def size(self) -> tuple[int, int]:
-        """(width, height) of the frames. [pixels]"""
+        """(width, height) of the frames, in pixels."""
         return self.camera.size
 
     def prepared(self, row: PlanRow) -> object:
@@ -113,8 +113,10 @@ class Plan:
         for row in self.rows:
             name = row.path + (f"[{row.instance}]" if row.instance else "") + (f":{row.subset}" if row.subset else "")
             forced = " (forced)" if row.forced else ""
-            lines.append(f"{row.reflector.id:3d} {name}: {row.technique}{forced}, {row.pixels} pixels, "
-                         f"{row.predicted['ms']:.1f} ms predicted")
+            lines.append(
+                f"{row.reflector.id:3d} {name}: {row.technique}{forced}, {row.pixels} pixels, "
+                f"{row.predicted['ms']:.1f} ms predicted"
+            )
             lines.append(f"      {row.reason}")
             for effect_name, effect in row.effects.items():
                 lines.append(f"      {'on ' if effect.on else 'off'} {effect_name}: {effect.reason}")
@@ -136,8 +138,8 @@ def make_plan(
         camera: Prim path or name of a camera in the stage, or a `Camera`; None: the stage's first.
         size: (width, height). [pixels]
         settings: The knobs; None: the defaults.
-        method: `auto`, `reference` (every mirror traced) or a key of `TECHNIQUES`; where it does not apply the mirror is
-            traced, with a note.
+        method: `auto`, `reference` (every mirror traced) or a key of `TECHNIQUES`; where it does not apply the mirror
+            is traced, with a note.
         reflectors: Glob patterns of prim paths that alone reflect; empty: what the materials say.
 
     Raises:
@@ -149,7 +151,9 @@ def make_plan(
         raise ValueError(f"unknown method '{method}'; nearest: {', '.join(near or [*METHODS, *TECHNIQUES])}")
     view = find_camera(scene, camera, size)
     notes: list[Note] = []
-    found = [(k, part, weight) for k, part in enumerate(scene.parts) if (weight := mirror_weight(scene, part, settings))]
+    found = [
+        (k, part, weight) for k, part in enumerate(scene.parts) if (weight := mirror_weight(scene, part, settings))
+    ]
     if reflectors:
         found = _chosen(scene, reflectors)
     pixels = _pixel_counts(scene, view, [k for k, _, _ in found], settings)
@@ -202,7 +206,9 @@ def _chosen(scene: Scene, patterns: tuple[str, ...]) -> list[tuple[int, PartRang
             if fnmatch.fnmatchcase(part.prim_path, pattern) or part.prim_path.startswith(pattern.rstrip("/") + "/")
         ]
         if not matching:
-            raise ValueError(f"reflector: '{pattern}' matches no drawn prim; give a prim path or a glob such as '/World/*'")
+            raise ValueError(
+                f"reflector: '{pattern}' matches no drawn prim; give a prim path or a glob such as '/World/*'"
+            )
         found += [row for row in matching if row[0] not in {k for k, _, _ in found}]
     return sorted(found, key=lambda row: row[0])
 
@@ -225,9 +231,7 @@ def _pixel_counts(scene: Scene, camera: Camera, parts: list[int], settings: Sett
         cy=camera.cy / shrink,
     )
     triangle = raster.draw_scene(scene, small, settings.threads).triangle.numpy()
-    patches = np.bincount(
-        scene.host_triangle_patch[triangle[triangle >= 0]], minlength=len(scene.patch_shapes)
-    )
+    patches = np.bincount(scene.host_triangle_patch[triangle[triangle >= 0]], minlength=len(scene.patch_shapes))
     scale = width * height / (small.size[0] * small.size[1])
     return {k: round(float(patches[list(scene.parts[k].patches)].sum()) * scale) for k in parts}
 

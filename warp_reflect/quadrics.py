@@ -374,9 +374,7 @@ def foot_bowl(w: Any, lam: Any, b: Any, c: Any, steps: int):
             low = mu
         else:
             high = mu
-        slope = (
-            p0 * lam[0] * m0 + p1 * lam[1] * m1
-        ) * inv_n * inv_n * inv_n + half * e1 * inv_e * inv_e * inv_e
+        slope = (p0 * lam[0] * m0 + p1 * lam[1] * m1) * inv_n * inv_n * inv_n + half * e1 * inv_e * inv_e * inv_e
         step = -h / slope
         if not (mu + step > low) or not (mu + step < high):
             step = half * (low + high) - mu
@@ -487,9 +485,7 @@ def first_guess(o: Any, v: Any, lam: Any, b: Any, c: Any, family: int, steps: in
 
 
 @wp.func
-def newton_on_convex(
-    start: Any, eye: Any, target: Any, lam: Any, b: Any, c: Any, family: int, steps: int, tol: Any
-):
+def newton_on_convex(start: Any, eye: Any, target: Any, lam: Any, b: Any, c: Any, family: int, steps: int, tol: Any):
     """Newton's method on the tangent plane, from a surface point, with the angle as merit.
 
     Args:

@@ -284,7 +284,7 @@ class Scene:
 
     @property
     def size(self) -> float:
-        """Length of the diagonal of the bounds. [scene units]"""
+        """Length of the diagonal of the bounds, in scene units."""
         if not self.vertex_count:
             return 1.0
         return float(np.linalg.norm(np.ptp(self.host_points.astype(np.float64), axis=0))) or 1.0
@@ -302,12 +302,12 @@ class Scene:
 
     @cached_property
     def neighbours(self) -> wp.array:
-        """Per triangle the triangle across each edge (v0v1, v1v2, v2v0), -1 where there is none. vec3i [triangle_count]"""
+        """vec3i [triangle_count]: the triangle across each edge (v0v1, v1v2, v2v0), -1 where there is none."""
         return wp.array(self._host_neighbours, dtype=wp.vec3i, device=self.device)
 
     @cached_property
     def closed_patches(self) -> wp.array:
-        """1 per patch of a part that is closed and wound outwards: no ray from outside meets its back first. int32"""
+        """int32 [patches]: 1 where the part is closed and wound outwards: no ray from outside meets its back first."""
         across = self._host_neighbours
         closed = np.zeros(max(len(self.patch_shapes), 1), np.int32)
         corner = self.host_points[self.host_triangles].astype(np.float64)

@@ -106,7 +106,12 @@ class Settings:
         _require(8 <= self.map_resolution <= 2048, "map_resolution", self.map_resolution, "8 to 2048 nodes")
         _require(0 <= self.walk_hops <= 64, "walk_hops", self.walk_hops, "0 to 64")
         _require(0 <= self.threads <= 1024, "threads", self.threads, "0 (all cores) to 1024")
-        _require(0.0 <= self.reflector_max_roughness <= 1.0, "reflector_max_roughness", self.reflector_max_roughness, "0 to 1")
+        _require(
+            0.0 <= self.reflector_max_roughness <= 1.0,
+            "reflector_max_roughness",
+            self.reflector_max_roughness,
+            "0 to 1",
+        )
         _require(0.0 <= self.reflector_min_weight <= 1.0, "reflector_min_weight", self.reflector_min_weight, "0 to 1")
 
     @classmethod
