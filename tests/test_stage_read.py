@@ -5,6 +5,7 @@ import pytest
 import stage_samples as samples
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, Vt
 
+from warp_reflect.stage.load import load_stage
 from warp_reflect.stage.read import StageReader, read_stage
 
 
@@ -623,3 +624,61 @@ def test_what_is_met_and_not_drawn_is_noted_once(stage):
 def test_impossible_arguments_are_named(stage, arguments):
     with pytest.raises(ValueError, match=next(iter(arguments))):
         read(stage, **arguments)
+
+
+def test_what_the_library_itself_refuses_is_told_prim_by_prim(tmp_path):
+    path = tmp_path / "wrong.usda"
+    quad = """
+    point3f[] points = [(0, 0, 0), (1, 0, 0), (0, 1, 0)]
+    int[] faceVertexCounts = [3]
+    int[] faceVertexIndices = [0, 1, 2]
+    uniform token subdivisionScheme = "none"
+"""
+    path.write_text(
+        f"""#usda 1.0
+def Mesh "Moved"
+{{{quad}
+    string xformOp:translate = "far"
+    uniform token[] xformOpOrder = ["xformOp:translate"]
+}}
+def Mesh "Bound"
+{{{quad}
+    string material:binding = "red"
+}}
+def Mesh "Normals"
+{{{quad}
+    normal3f[] normals = [(0, 0, 1)] (
+        interpolation = "sometimes"
+    )
+}}
+"""
+    )
+    data = read_stage(path)
+    assert [i.prim_path for i in data.instances] == ["/Bound", "/Normals"]
+    found = texts(data)
+    assert any(text.startswith("/Moved: ") and "opType" in text and text.endswith("dropped") for text in found)
+    assert any(text.startswith("/Bound: material:binding: ") for text in found)
+    assert any("/Normals: normals: got interpolation 'sometimes'" in text for text in found)
+    with pytest.raises(ValueError, match="</Moved>: "):
+        read_stage(path, strict=True)
+
+
+def test_scene_moves_through_time(stage):
+    quad = samples.add_quad(stage, "/Quad")
+    move = quad.AddTranslateOp()
+    move.Set(Gf.Vec3d(0, 0, 1), 1.0)
+    move.Set(Gf.Vec3d(0, 0, 5), 5.0)
+    scene = load_stage(samples.saved(stage))
+    later = scene.at(3.0)
+    assert scene.data.instances[0].world_from_object[2, 3] == 1.0
+    assert later.data.instances[0].world_from_object[2, 3] == 3.0 and later.data.time == 3.0
+    assert later.data.meshes[0] is scene.data.meshes[0]
+    assert later.at(5.0).data.instances[0].world_from_object[2, 3] == 5.0
+
+
+def test_untrusted_scene_is_read_again_in_a_child(stage):
+    move = samples.add_quad(stage, "/Quad").AddTranslateOp()
+    move.Set(Gf.Vec3d(0, 0, 1), 1.0)
+    move.Set(Gf.Vec3d(0, 0, 5), 5.0)
+    scene = load_stage(samples.saved(stage), time=1.0, untrusted=True)
+    assert [s.data.instances[0].world_from_object[2, 3] for s in (scene, scene.at(5.0))] == [1.0, 5.0]

@@ -6,13 +6,13 @@ import itertools
 from dataclasses import dataclass, field
 
 import numpy as np
-from pxr import UsdGeom, UsdLux
+from pxr import Tf, UsdGeom, UsdLux
 
 from warp_reflect.scene import CameraData, InstanceData, MeshData, Note, SceneData
 from warp_reflect.stage.cameras import default_camera
 from warp_reflect.stage.detail import pixels_across, subdivision_level
 from warp_reflect.stage.geometry import SMOOTH_SCHEMES, read_gprim, read_mesh, subdivision_scheme
-from warp_reflect.stage.intake import BadPrim, Intake, floats, transform_fault
+from warp_reflect.stage.intake import BadPrim, Intake, floats, library_message, transform_fault
 from warp_reflect.stage.materials import MaterialTable, Surface
 from warp_reflect.stage.reflectors import matches, may_reflect, part_names
 
@@ -129,8 +129,9 @@ class Assembly:
             before = len(self.intake.notes)
             try:
                 entry = self._read(prim, level, uv_name, color_name)
-            except BadPrim as fault:
-                self.intake.bad(prim.GetPath(), f"{fault}; prim dropped")
+            except (BadPrim, Tf.ErrorException) as fault:
+                reason = library_message(fault) if isinstance(fault, Tf.ErrorException) else fault
+                self.intake.bad(prim.GetPath(), f"{reason}; prim dropped")
                 return None
             entry.notes = self.intake.notes[before:]
             if not changes_in_time(prim):

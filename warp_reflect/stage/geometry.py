@@ -10,7 +10,7 @@ from pxr import UsdGeom, UsdShade
 from warp_reflect.scene import MeshData, Part
 from warp_reflect.stage import gprims
 from warp_reflect.stage.intake import COORDINATE_MAX, BadPrim, Intake, floats, integers, number, token
-from warp_reflect.stage.primvars import CornerAttribute, read_primvar, read_uvs
+from warp_reflect.stage.primvars import INTERPOLATIONS, CornerAttribute, read_primvar, read_uvs
 from warp_reflect.stage.subdivide import BOUNDARY_RULES, Cage, subdivide
 from warp_reflect.stage.triangulate import triangulate
 
@@ -487,7 +487,13 @@ def _normals(mesh: UsdGeom.Mesh, intake: Intake) -> tuple[CornerAttribute | None
         return None, "normals"
     if values is None or not len(values):
         return None, "normals"
-    return CornerAttribute(values, None, str(mesh.GetNormalsInterpolation())), "normals"
+    interpolation = str(mesh.GetNormalsInterpolation())
+    if interpolation not in INTERPOLATIONS:
+        intake.bad(
+            mesh.GetPath(), f"normals: got interpolation {interpolation!r}, expected a UsdGeomPrimvar one; not used"
+        )
+        return None, "normals"
+    return CornerAttribute(values, None, interpolation), "normals"
 
 
 def _unit_normals(values, index, points, triangles, path, intake: Intake) -> tuple[np.ndarray, np.ndarray]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import dataclass, field
 
 # Set before pxr loads: a crate file cut short by another process then raises instead of killing this one
@@ -10,7 +11,7 @@ from dataclasses import dataclass, field
 os.environ.setdefault("USDC_USE_PREAD", "1")
 
 import numpy as np
-from pxr import Usd
+from pxr import Tf, Usd
 
 from warp_reflect.scene import Note
 from warp_reflect.stage.guard import Limits
@@ -122,6 +123,12 @@ def token(attribute: Usd.Attribute, time: Usd.TimeCode, allowed: tuple[str, ...]
     if value not in allowed:
         raise BadPrim(f"{attribute.GetName()}: got {value!r}, expected one of {', '.join(allowed)}")
     return str(value)
+
+
+def library_message(fault: Tf.ErrorException) -> str:
+    """The innermost message of the library's error list as one line, without positions in its source."""
+    messages = re.findall(r" : '(.*?)'\s*(?:$|\n\s*Error in)", str(fault), flags=re.DOTALL)
+    return " ".join((messages[0] if messages else str(fault)).split())
 
 
 def column_matrix(matrix) -> np.ndarray:

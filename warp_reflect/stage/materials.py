@@ -6,10 +6,10 @@ import dataclasses
 from dataclasses import dataclass, field
 
 import numpy as np
-from pxr import UsdShade
+from pxr import Tf, UsdShade
 
 from warp_reflect.scene import MaterialData, TextureRef
-from warp_reflect.stage.intake import Intake
+from warp_reflect.stage.intake import Intake, library_message
 from warp_reflect.stage.primvars import display_color, read_primvar
 from warp_reflect.stage.textures import is_texture, read_texture, scaled, value_of
 
@@ -134,7 +134,11 @@ class MaterialTable:
     def bound(self, target) -> Surface | None:
         """The material bound to a prim or GeomSubset; None where there is none that is understood."""
         binding = UsdShade.MaterialBindingAPI(target)
-        material, relationship = binding.ComputeBoundMaterial(UsdShade.Tokens.full)
+        try:
+            material, relationship = binding.ComputeBoundMaterial(UsdShade.Tokens.full)
+        except Tf.ErrorException as fault:
+            self.intake.bad(target.GetPath(), f"material:binding: {library_message(fault)}; not used")
+            return None
         if not material:
             if relationship:
                 targets = ", ".join(f"<{t}>" for t in relationship.GetTargets())

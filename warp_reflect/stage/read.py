@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,7 +12,7 @@ import numpy as np
 from warp_reflect.scene import SceneData
 from warp_reflect.settings import COMPLEXITIES
 from warp_reflect.stage.guard import Limits, check_file, confinement_fault
-from warp_reflect.stage.intake import Intake  # before pxr: sets USDC_USE_PREAD
+from warp_reflect.stage.intake import Intake, library_message  # before pxr: sets USDC_USE_PREAD
 
 from pxr import Sdf, Tf, Usd, UsdGeom, UsdUtils  # isort: skip
 
@@ -96,22 +95,29 @@ class StageReader:
             raise ValueError(f"time: got {time}, expected a finite time code")
         code = Usd.TimeCode.EarliestTime() if time is None else Usd.TimeCode(float(time))
         intake = Intake(code, self.strict, self.limits, cache=self._pictures)
-        with quiet():
-            data = self._metadata(time, intake)
-            for error in self.stage.GetCompositionErrors():
-                intake.bad(error.rootSite.path, f"composition: {_one_line(str(error))}")
-            walk = Walk(self.stage, intake, self.purposes, self.path, data.up_axis)
-            placed = walk.below(self.stage.GetPseudoRoot(), State(np.eye(4)), Usd.PrimDefaultPredicate)
-            data.lights, data.cameras = walk.lights, self._primary_first(walk.cameras)
-            Assembly(intake, self.level, self.reflectors, self._static).complete(data, walk.drawn, placed)
+        try:
+            with quiet():
+                data = self._read(time, intake)
+        except Tf.ErrorException as fault:
+            raise ValueError(f"cannot read {self.path}: {library_message(fault)}") from None
+        if self.reflectors:
+            override_reflectors(data, self.reflectors)
+        data.notes = intake.notes
+        return data
+
+    def _read(self, time: float | None, intake: Intake) -> SceneData:
+        data = self._metadata(time, intake)
+        for error in self.stage.GetCompositionErrors():
+            intake.bad(error.rootSite.path, f"composition: {' '.join(str(error).split())}")
+        walk = Walk(self.stage, intake, self.purposes, self.path, data.up_axis)
+        placed = walk.below(self.stage.GetPseudoRoot(), State(np.eye(4)), Usd.PrimDefaultPredicate)
+        data.lights, data.cameras = walk.lights, self._primary_first(walk.cameras)
+        Assembly(intake, self.level, self.reflectors, self._static).complete(data, walk.drawn, placed)
         if not data.instances:
             intake.note("/", "the stage holds no geometry that can be drawn")
         if not any(light.kind in SHADED_KINDS for light in data.lights):
             data.lights.append(default_dome())
             intake.note(data.lights[-1].path, "the stage has no light that is used; a grey dome lights it")
-        if self.reflectors:
-            override_reflectors(data, self.reflectors)
-        data.notes = intake.notes
         return data
 
     def _primary_first(self, cameras: list) -> list:
@@ -188,7 +194,7 @@ def open_stage(path: str, limits: Limits) -> Usd.Stage:
                 if fault:
                     raise ValueError(f"cannot read {path}: the layer {layer.realPath} is {fault}")
         except Tf.ErrorException as fault:
-            raise ValueError(f"cannot read {path}: {_tf_message(fault)}") from None
+            raise ValueError(f"cannot read {path}: {library_message(fault)}") from None
     return stage
 
 
@@ -200,13 +206,3 @@ def quiet() -> Iterator[None]:
         yield
     finally:
         delegate.TakeUncoalescedDiagnostics()
-
-
-def _tf_message(fault: Tf.ErrorException) -> str:
-    """The innermost message of a Tf error list, without source positions."""
-    messages = re.findall(r" : '(.*?)'\s*(?:$|\n\s*Error in)", str(fault), flags=re.DOTALL)
-    return _one_line(messages[0] if messages else str(fault))
-
-
-def _one_line(text: str) -> str:
-    return " ".join(text.split())

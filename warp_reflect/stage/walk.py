@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from pxr import Usd, UsdGeom
+from pxr import Tf, Usd, UsdGeom
 
 from warp_reflect.scene import CameraData, InstanceData, LightData
 from warp_reflect.stage.cameras import read_camera
 from warp_reflect.stage.instancer import expand, read_instancer
-from warp_reflect.stage.intake import BadPrim, Intake, column_matrix
+from warp_reflect.stage.intake import BadPrim, Intake, column_matrix, library_message
 from warp_reflect.stage.lights import read_light
 
 ANALYTIC = frozenset(("Sphere", "Cube", "Cylinder", "Cylinder_1", "Cone", "Capsule", "Capsule_1", "Plane"))
@@ -92,7 +92,11 @@ class Walk:
             if self.elsewhere and str(prim.GetPath()) in self.elsewhere:
                 self.intake.note(prim.GetPath(), "a point instancer's prototype: drawn by the instancer only")
                 continue
-            own = self.visit(prim, state, found)
+            try:
+                own = self.visit(prim, state, found)
+            except Tf.ErrorException as fault:
+                self.intake.bad(prim.GetPath(), f"{library_message(fault)}; prim and what is below dropped")
+                continue
             if own is not None:
                 stack.extend((child, own) for child in reversed(prim.GetFilteredChildren(predicate)))
         return found
