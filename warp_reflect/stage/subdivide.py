@@ -432,7 +432,7 @@ def _limit(scheme: str, state: _State, edges: _Edges, fans: _Fans) -> tuple[np.n
     behind = points[state.indices[edges.prev_corner]]
     fan, fan_count = fans.fan_of_corner, len(fans.vertex)
     size = fans.size.astype(np.float64)
-    n, step = size[fan], fans.place.astype(np.float64)
+    step = fans.place.astype(np.float64)
 
     smooth_fan = fans.closed & (state.vertex_sharpness[fans.vertex] == 0.0)
     limit = points.copy()
@@ -457,16 +457,20 @@ def _limit(scheme: str, state: _State, edges: _Edges, fans: _Fans) -> tuple[np.n
     across = None if across is None else across[:, :3]
     first, second = np.zeros((fan_count, 3)), np.zeros((fan_count, 3))
     if ring.any():
-        angle = 2.0 * np.pi / n
-        for tangent, phase in ((first, 0.0), (second, -0.5 * np.pi)):
-            here, there = np.cos(step * angle + phase), np.cos((step + 1.0) * angle + phase)
+        angle = 2.0 * np.pi / size  # per fan; per corner only one sine and cosine are taken
+        turn, c, s = step * angle[fan], np.cos(angle), np.sin(angle)
+        cosine, sine = np.where(ring, np.cos(turn), 0.0), np.where(ring, np.sin(turn), 0.0)
+        weight = 1.0 + c + np.cos(0.5 * angle) * np.sqrt(2.0 * (9.0 + c)) if across is not None else None
+        for tangent, here, there in (
+            (first, cosine, cosine * c[fan] - sine * s[fan]),
+            (second, sine, sine * c[fan] + cosine * s[fan]),
+        ):
+            along_edges = _sums(fan, here[:, None] * ahead, fan_count)
             if across is None:
-                value = here[:, None] * ahead
+                tangent += along_edges
             else:
-                c = np.cos(angle)
-                weight = 1.0 + c + np.cos(0.5 * angle) * np.sqrt(2.0 * (9.0 + c))
-                value = (weight * here)[:, None] * ahead + (here + there)[:, None] * across
-            tangent += _sums(fan[ring], value[ring], fan_count)
+                tangent += weight[:, None] * along_edges
+                tangent += _sums(fan, (here + there)[:, None] * across, fan_count)
     open_fan = ~smooth_fan
     if open_fan.any():
         _open_tangents(first, second, xyz[fans.vertex], fan, fans, ahead, behind, across, crease[fans.vertex])
