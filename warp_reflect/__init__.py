@@ -26,7 +26,7 @@ _HOME = {
     "render_frame": "frame",
     "solve": "solver",
 }
-__all__ = ["__version__", *sorted(_HOME)]
+__all__ = list(_HOME)
 
 
 def __getattr__(name: str):

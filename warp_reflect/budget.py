@@ -8,11 +8,12 @@ from warp_reflect.settings import Settings
 
 # Microseconds per element on one CPU thread (a 2026 server core). Ratios between them decide, and those vary less from
 # machine to machine than the figures.
-SEARCH_US = 0.20  # per vertex, between a warm (0.13) and a cold (0.45) start
-RASTER_US = 0.17  # per virtual triangle
-REFINE_US = 0.085  # per mirror pixel
-TRACE_US = 0.47  # per mirror pixel at 88,000 triangles; grows with their logarithm, which is left out
+SEARCH_US = 0.16  # per virtual vertex, between a warm (0.13) and a cold (0.45) start
+RASTER_US = 0.35  # per virtual triangle, the clipping at the hidden boundary included
+REFINE_US = 0.18  # per mirror pixel
+TRACE_US = 0.6  # per mirror pixel at 60,000 triangles; grows with their logarithm, which is left out
 DOUBT_SHARE = 0.05  # of the mirror pixels that refinement leaves to the BVH
+CURVED_SHARE = 2.0  # virtual vertices and triangles per one of the scene, where a curved mirror bends edges
 
 
 def predict(scene: Scene, technique: str, pixels: int, settings: Settings) -> dict[str, float]:
@@ -22,6 +23,8 @@ def predict(scene: Scene, technique: str, pixels: int, settings: Settings) -> di
     if technique == "raytraced" or pixels == 0:
         return {"error_px": 0.0, "ms": 1e-3 * traced / threads, "bytes": 0}
     forward = scene.vertex_count * SEARCH_US + scene.triangle_count * RASTER_US
+    if technique != "planar":
+        forward *= CURVED_SHARE
     if settings.refine == "exact":
         forward += pixels * (REFINE_US + DOUBT_SHARE * TRACE_US)
     bytes_ = 6 * settings.map_resolution**2 * 32

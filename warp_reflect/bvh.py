@@ -309,9 +309,7 @@ def retry_pixels_kernel(
                 again = int(1)
     if again == 0 and neighbours > 0:
         return
-    hit = trace_ray(
-        mesh_id, scene, point[i], moved_direction(direction[i]), normal[i], facets[pixel[i]], body, 0
-    )
+    hit = trace_ray(mesh_id, scene, point[i], moved_direction(direction[i]), normal[i], facets[pixel[i]], body, 0)
     if hit.status == SKY:
         return
     out_triangle[i] = hit.triangle
@@ -428,9 +426,7 @@ def trace_pixels(
         int(index is not None),
     ]
     outputs = [layer.triangle, layer.u, layer.v, layer.distance, layer.status]
-    launch.launch(
-        trace_pixels_kernel, count, rays + outputs, scene.device, threads, split_min=TRACE_SPLIT_MIN
-    )
+    launch.launch(trace_pixels_kernel, count, rays + outputs, scene.device, threads, split_min=TRACE_SPLIT_MIN)
     # The neighbours' answers are read from a copy, so that the order of threads cannot matter.
     before = wp.clone(layer.status)
     launch.launch(retry_pixels_kernel, count, [*rays, before, *outputs], scene.device, threads)

@@ -33,9 +33,7 @@ SIDE_MAX = 32768  # pixels; what the image readers of this package accept back
 # What a user's input can cause; anything else is a fault of this program.
 REFUSALS = (ValueError, KeyError, OSError, NotImplementedError, MemoryError)
 
-app = cyclopts.App(
-    name="warp-reflect", help="Accurate specular reflections on curved objects, for OpenUSD stages."
-)
+app = cyclopts.App(name="warp-reflect", help="Accurate specular reflections on curved objects, for OpenUSD stages.")
 
 
 @Parameter(name="*")
@@ -182,9 +180,7 @@ def render(
             if opened.debug:
                 traceback.print_exc()
             _tell(f"error: {label}: {_line(error)}")
-            _tell(
-                f"kept {len(written)} finished file{'s' if len(written) > 1 else ''}: {_shortened(written)}"
-            )
+            _tell(f"kept {len(written)} finished file{'s' if len(written) > 1 else ''}: {_shortened(written)}")
             return PART_WAY
     return DONE
 
@@ -200,9 +196,7 @@ def _render_one(scene, made, previous, row: list[str], channels: list[str] | Non
         frame.write(name, channels=channels)
         written.append(name)
         width, height = made.size
-        print(
-            f"{name}: {width}x{height}, {rendered_ms:.0f} ms{_statistics_line(frame.statistics)}", flush=True
-        )
+        print(f"{name}: {width}x{height}, {rendered_ms:.0f} ms{_statistics_line(frame.statistics)}", flush=True)
     return frame
 
 
@@ -239,9 +233,7 @@ def compare(
     (channels_a, header_a), (channels_b, header_b) = images.read_exr(a), images.read_exr(b)
     eyes = header_a.get("warp_reflect:eye"), header_b.get("warp_reflect:eye")
     if None not in eyes and eyes[0] != eyes[1]:
-        raise ValueError(
-            f"{a} and {b} were made from different eyes, {eyes[0]} and {eyes[1]}; nothing to compare"
-        )
+        raise ValueError(f"{a} and {b} were made from different eyes, {eyes[0]} and {eyes[1]}; nothing to compare")
     result = metrics.compare_frames(channels_a, channels_b)
     print(json.dumps(result.to_json(), indent=2, allow_nan=False) if json_ else result)
     return DONE
@@ -309,9 +301,7 @@ def _settings(planned: PlanOptions):
     for item in planned.set_ or []:
         name, equals, value = item.partition("=")
         if not equals:
-            raise ValueError(
-                f"--set: got '{item}', expected name=value with a name of {', '.join(Settings.names())}"
-            )
+            raise ValueError(f"--set: got '{item}', expected name=value with a name of {', '.join(Settings.names())}")
         changes[name.strip()] = value.strip()
     if planned.complexity is not None:
         changes["complexity"] = planned.complexity
@@ -517,9 +507,7 @@ def heal_kernel_cache(cache: Path) -> list[Path]:
     Returns:
         The folders deleted.
     """
-    damaged = [
-        folder for folder in cache.glob("wp_warp_reflect*") if folder.is_dir() and not _is_whole(folder)
-    ]
+    damaged = [folder for folder in cache.glob("wp_warp_reflect*") if folder.is_dir() and not _is_whole(folder)]
     for folder in damaged:
         shutil.rmtree(folder, ignore_errors=True)
     return damaged

@@ -149,9 +149,7 @@ def write_exr(
     for name, array in channels.items():
         array = np.asarray(array)
         if array.ndim not in (2, 3):
-            raise ValueError(
-                f"channel '{name}': got shape {array.shape}, expected [height, width] or [.., .., n]"
-            )
+            raise ValueError(f"channel '{name}': got shape {array.shape}, expected [height, width] or [.., .., n]")
         is_half = name in half or name.rpartition(".")[0] in half
         for suffix, plane in _split(name, array, is_half):
             names.append(suffix)
@@ -164,9 +162,7 @@ def write_exr(
     replaced = 0
     for k, (name, plane) in enumerate(zip(names, planes, strict=True)):
         if plane.shape != (height, width):
-            raise ValueError(
-                f"channel '{name}': got shape {plane.shape}, expected {(height, width)} as the first"
-            )
+            raise ValueError(f"channel '{name}': got shape {plane.shape}, expected {(height, width)} as the first")
         with np.errstate(over="ignore"):
             values = plane.astype(np.float32)
         good = np.isfinite(values)
@@ -251,9 +247,7 @@ def read_exr(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict[str, 
     return channels, {item.name: _parsed(item.value) for item in spec.extra_attribs}
 
 
-def read_image(
-    path: str | os.PathLike, color_space: str = "auto", size_limit_mb: int = SIZE_LIMIT_MB
-) -> Picture:
+def read_image(path: str | os.PathLike, color_space: str = "auto", size_limit_mb: int = SIZE_LIMIT_MB) -> Picture:
     """Read a texture or an environment map.
 
     Args:
@@ -310,9 +304,7 @@ def _declared_primaries(spec):
     declared = spec.getattribute("chromaticities")
     if declared is None or len(declared) != 8:
         declared = NAMED_PRIMARIES.get(spec.get_string_attribute("oiio:ColorSpace").lower())
-    if declared is None or np.allclose(
-        declared, REC709_PRIMARIES, atol=1e-3
-    ):  # 3 digits are what files write
+    if declared is None or np.allclose(declared, REC709_PRIMARIES, atol=1e-3):  # 3 digits are what files write
         return None
     triangle = np.asarray(declared, float)[:6].reshape(3, 2)
     edges = triangle[1:] - triangle[0]

@@ -143,9 +143,7 @@ def compare_frames(a: Mapping, b: Mapping) -> Comparison:
     """
     ra, rb = _channel(a, "reflectorId"), _channel(b, "reflectorId")
     if ra.shape != rb.shape:
-        raise ValueError(
-            f"frames differ in size: {ra.shape[1]}x{ra.shape[0]} and {rb.shape[1]}x{rb.shape[0]}"
-        )
+        raise ValueError(f"frames differ in size: {ra.shape[1]}x{ra.shape[0]} and {rb.shape[1]}x{rb.shape[0]}")
     ra, rb = np.rint(ra).astype(np.int64), np.rint(rb).astype(np.int64)
     ia, ib = (np.rint(_channel(f, "reflectedId")).astype(np.int64) for f in (a, b))
     sky_a, sky_b = (np.rint(_channel(f, "status")) == Status.SKY for f in (a, b))
@@ -207,9 +205,7 @@ def _channel(frame: Mapping, name: str) -> np.ndarray:
     try:
         return np.asarray(frame[name])
     except KeyError:
-        raise ValueError(
-            f"a frame lacks the channel '{name}'; render it with every channel to compare it"
-        ) from None
+        raise ValueError(f"a frame lacks the channel '{name}'; render it with every channel to compare it") from None
 
 
 def _same_around(ids: np.ndarray) -> np.ndarray:
@@ -343,8 +339,7 @@ class _ReferenceField:
             goods.append((self.key[r, c] == key) & ((r != row) | (c != column)))
             slopes.append(sign * (self.points[r, c] - here))
         lengths = [
-            np.where(good, np.linalg.norm(slope, axis=-1), np.inf)
-            for good, slope in zip(goods, slopes, strict=True)
+            np.where(good, np.linalg.norm(slope, axis=-1), np.inf) for good, slope in zip(goods, slopes, strict=True)
         ]
         ahead = (lengths[0] <= lengths[1])[:, None]
         return np.where(ahead, slopes[0], slopes[1]), goods[0] | goods[1]

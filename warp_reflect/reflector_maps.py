@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from warp_reflect.bodies import Body, analyse
+from warp_reflect.bodies import analyse
 from warp_reflect.cubemap import FACE_COUNT, cube_point, face_axes, node_directions, project_to_cube
 from warp_reflect.launch import launch
 from warp_reflect.layers import CameraView
@@ -166,14 +166,12 @@ class ReflectorMap:
         triangle = _draw_faces((local / extent).astype(np.float32), faces, resolution)
         position, normal = _surface_along(local, faces, normals, triangle, directions.reshape(-1, 3))
         if polish is not None:
-            axes_inverse = np.linalg.inv(unit_from_body[:3, :3])
             world_directions = directions.reshape(-1, 3) @ body.axes
             distance = np.linalg.norm(position, axis=1) / scale
             distance, body_normal = polish(triangle, body.centre, world_directions, distance)
             position = directions.reshape(-1, 3) * (distance * scale)[:, None]
             analytic = np.linalg.norm(body_normal, axis=1) > 0.5
             normal[analytic] = body_normal[analytic] @ body.axes.T
-            del axes_inverse
         texels = np.zeros((FACE_COUNT, resolution, resolution, 8), np.float32)
         texels[..., 0:3] = position.reshape(cube.shape)
         texels[..., 4:7] = normal.reshape(cube.shape)
@@ -247,9 +245,7 @@ def _surface_along(points, faces, normals, triangle, directions) -> tuple[np.nda
     """Point and interpolated unit normal where the rays from 0 meet the given triangles' planes."""
     corner = points[faces[triangle]]
     a, b, c = corner[:, 0], corner[:, 1], corner[:, 2]
-    weights = np.stack(
-        [np.einsum("ij,ij->i", directions, np.cross(p, q)) for p, q in ((b, c), (c, a), (a, b))], axis=1
-    )
+    weights = np.stack([np.einsum("ij,ij->i", directions, np.cross(p, q)) for p, q in ((b, c), (c, a), (a, b))], axis=1)
     weights = np.maximum(weights, 0.0)  # a node on an edge may lie outside by the rasteriser's 1/256 of a node
     weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1.0e-300)
     facet = np.cross(b - a, c - a)
@@ -266,5 +262,7 @@ def _whitened_radii(whitened: np.ndarray, faces: np.ndarray, nodes: np.ndarray) 
     area = np.linalg.norm(facet, axis=1)
     solid = area > 1.0e-9 * area.max()
     height = np.einsum("ij,ij->i", facet[solid], corner[solid][:, 0]) / area[solid]
-    outer = max(float(np.linalg.norm(whitened[faces.reshape(-1)], axis=1).max()), float(np.linalg.norm(nodes, axis=1).max()))
+    outer = max(
+        float(np.linalg.norm(whitened[faces.reshape(-1)], axis=1).max()), float(np.linalg.norm(nodes, axis=1).max())
+    )
     return float(height.min()) * (1.0 - 1.0e-5), outer * (1.0 + 1.0e-5)

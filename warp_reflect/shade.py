@@ -93,9 +93,7 @@ def dome_moments(texture: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
     lat = (0.5 - (np.arange(height) + 0.5) / height) * np.pi
     lon = (1.0 - 2.0 * (np.arange(width) + 0.5) / width) * np.pi
     # The map's rows against functions of the longitude first: five sums a row hold all moments.
-    functions = np.stack(
-        [np.ones(width), np.sin(lon), np.cos(lon), np.sin(lon) ** 2, np.sin(lon) * np.cos(lon)]
-    )
+    functions = np.stack([np.ones(width), np.sin(lon), np.cos(lon), np.sin(lon) ** 2, np.sin(lon) * np.cos(lon)])
     one, sx, cz, sxx, sxz = np.einsum("kw,hwc->khc", functions, texture.astype(np.float64), optimize=True)
     c, s = np.cos(lat)[:, None], np.sin(lat)[:, None]
 
@@ -268,11 +266,7 @@ def split_lobes(
     if scene.materials[material].uses_vertex_color != 0 and scene.color_index.shape[0] > 0:
         index = scene.color_index[triangle]
         if index[0] >= 0:
-            color = (
-                (1.0 - u - v) * scene.colors[index[0]]
-                + u * scene.colors[index[1]]
-                + v * scene.colors[index[2]]
-            )
+            color = (1.0 - u - v) * scene.colors[index[0]] + u * scene.colors[index[1]] + v * scene.colors[index[2]]
             metallic = scene.materials[material].metallic
             if metallic > 0.0:
                 dielectric = (1.0 - metallic) * coat_f0
@@ -331,9 +325,7 @@ def weights_matter(scene: SceneView, triangle: int) -> bool:
 
 
 @wp.func
-def hit_radiance(
-    scene: SceneView, lights: LightView, triangle: int, u: float, v: float, direction: wp.vec3
-) -> wp.vec3:
+def hit_radiance(scene: SceneView, lights: LightView, triangle: int, u: float, v: float, direction: wp.vec3) -> wp.vec3:
     """Radiance back along a unit ray: of the surface it hits, which mirrors only the dome, or of the dome."""
     base = wp.vec3(0.0, 0.0, 0.0)
     weight = wp.vec3(1.0, 1.0, 1.0)

@@ -64,9 +64,7 @@ def facet_normal(v0: wp.vec3, v1: wp.vec3, v2: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def intersect_triangle(
-    origin: wp.vec3, direction: wp.vec3, v0: wp.vec3, v1: wp.vec3, v2: wp.vec3
-) -> TriangleHit:
+def intersect_triangle(origin: wp.vec3, direction: wp.vec3, v0: wp.vec3, v1: wp.vec3, v2: wp.vec3) -> TriangleHit:
     """Intersect a line with a triangle; two triangles that share an edge never both miss a line through it.
 
     The edge functions are Pluecker products built from the difference and the sum of an edge's ends. Swapping

@@ -115,9 +115,7 @@ def polish(scene: SceneView, triangle: int, p: wp.vec3, direction: wp.vec3) -> w
 
 
 @wp.func
-def surface_at(
-    scene: SceneView, camera: CameraView, triangle: int, depth_key: float, x: float, y: float
-) -> Surface:
+def surface_at(scene: SceneView, camera: CameraView, triangle: int, depth_key: float, x: float, y: float) -> Surface:
     """The surface that the eye sees at pixel coordinate (x, y) on a triangle of the G-buffer.
 
     A polished point is the pixel ray's own; the facet, or in perspective the depth key alone, tells where to

@@ -39,7 +39,9 @@ HIDDEN = wp.constant(int(Status.HIDDEN))
 MAX_ITERATIONS = wp.constant(int(Status.MAX_ITERATIONS))
 SKY = wp.constant(int(Status.SKY))
 ESTIMATE = wp.constant(8.0 / 1.5)
-BOUNDARY_STEPS = 12  # bisections of an edge at the hidden boundary: 1/4096 of its length, below a pixel
+# Bisections of an edge at the hidden boundary: 1/4096 of its length, below a pixel, or, where refinement finds the exact
+# hit anyway, a candidate close enough to walk from.
+BOUNDARY_STEPS = {"off": 12, "exact": 5}
 
 
 @wp.struct
@@ -292,9 +294,7 @@ def reflect(
         layer.statistics.update(candidate=pixels.count)
     else:
         with timer("refine"):
-            doubtful = refine.settle(
-                scene, gbuffer, pixels, target, mesh.parents, layer, settings, trust_sky=failed == 0
-            )
+            doubtful = refine.settle(scene, gbuffer, pixels, target, mesh, layer, settings, trust_sky=failed == 0)
         with timer("trace"):
             bvh.trace_pixels(
                 scene, gbuffer, pixels, layer, reflector.part, reflector.convex, doubtful, settings.threads

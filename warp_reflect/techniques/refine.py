@@ -17,6 +17,7 @@ from warp_reflect.layers import GBuffer, MirrorPixels, ReflectionLayer
 from warp_reflect.scene import Scene, SceneView
 from warp_reflect.settings import Settings, Status
 from warp_reflect.shapes import clamp_weights, intersect_triangle
+from warp_reflect.techniques.virtual_mesh import VirtualMesh
 
 wp.set_module_options({"enable_backward": False})
 
@@ -32,9 +33,9 @@ EMPTY = wp.constant(3)
 # Of the depth key. A surface seen in a mirror is smooth on the screen: its key's second difference stays below this;
 # what exceeds it is the edge of a nearer object.
 DEPTH_STEP = wp.constant(0.01)
-# Of the depth key: a smaller rise may be a step of the same mesh (a tile over its joint); the neighbour's triangle is tested.
+# Of the depth key: a smaller rise may be a step of the same mesh (a tile over its joint); its triangle is tested.
 FINE_STEP = wp.constant(2.0e-4)
-# Candidates of another patch at nearly the same depth (a plate on a table) are tested too and the nearer hit is taken.
+# Candidates of another patch at nearly the same depth (a label on a bottle) are tested too and the nearer hit is taken.
 NEARER_SHARE = wp.constant(0.98)
 
 
@@ -103,18 +104,23 @@ def walk(
 
 
 @wp.func
-def cell_key(target: raster.TargetView, x: int, y: int) -> wp.uint64:
-    """Z-buffer key at an image pixel, 0 outside the box."""
-    if x < target.x0 or x >= target.x1 or y < target.y0 or y >= target.y1:
-        return wp.uint64(0)
-    return target.key[(y - target.y0) * (target.x1 - target.x0) + x - target.x0]
+def cell_key(target: raster.TargetView, cell: int, inside: bool, x: int, y: int, dx: int, dy: int) -> wp.uint64:
+    """Z-buffer key beside a pixel, 0 outside the box; `inside`: the whole 3x3 neighbourhood lies in the box."""
+    if not inside:
+        if x + dx < target.x0 or x + dx >= target.x1 or y + dy < target.y0 or y + dy >= target.y1:
+            return wp.uint64(0)
+    return target.key[cell + dy * (target.x1 - target.x0) + dx]
 
 
 @wp.func
-def is_mirror(target: raster.TargetView, x: int, y: int) -> bool:
-    if x < target.x0 or x >= target.x1 or y < target.y0 or y >= target.y1:
-        return False
-    return target.mask[y * target.mask_width + x] == target.mask_value
+def rise(near: float, depth: float, opposite: float) -> float:
+    """By how much a neighbour's depth key stands above the surface that the pixel and the opposite neighbour span.
+
+    Only a rise counts: an opposite side that falls away (or is empty, 0) is a farther surface.
+    """
+    if opposite > 0.0:
+        return near - depth - wp.max(depth - opposite, 0.0)
+    return near - depth
 
 
 @wp.kernel
@@ -125,6 +131,7 @@ def settle_kernel(
     closed: wp.array(dtype=int),
     target: raster.TargetView,
     parents: wp.array(dtype=int),
+    patches: wp.array(dtype=int),
     # Mirror pixels:
     pixel: wp.array(dtype=int),
     point: wp.array(dtype=wp.vec3),
@@ -143,55 +150,55 @@ def settle_kernel(
     """One thread per mirror pixel."""
     i = first + wp.tid()
     out_settled[i] = wp.uint8(DOUBT)
-    x = pixel[i] % target.mask_width
     y = pixel[i] / target.mask_width
-    key = cell_key(target, x, y)
-    drawn = raster.key_triangle(key)
-    if drawn < 0:
+    x = pixel[i] - y * target.mask_width
+    cell = (y - target.y0) * (target.x1 - target.x0) + x - target.x0
+    key = target.key[cell]
+    inside = x > target.x0 and x + 1 < target.x1 and y > target.y0 and y + 1 < target.y1
+    if key == wp.uint64(0):
         if trust_sky == 0:
             return
         for dy in range(-1, 2):
             for dx in range(-1, 2):
-                if cell_key(target, x + dx, y + dy) != wp.uint64(0):
+                if cell_key(target, cell, inside, x, y, dx, dy) != wp.uint64(0):
                     return
         out_triangle[i] = -1
         out_status[i] = wp.uint8(SKY)
         out_settled[i] = wp.uint8(EMPTY)
         return
+    drawn = raster.key_triangle(key)
     candidate = parents[drawn]
+    patch = patches[drawn]
     hit = walk(scene, neighbours, point[i], direction[i], candidate, hop_count)
     if hit.triangle < 0 or hit.turned != 0:
         return
     if hit.from_behind != 0 and closed[scene.triangle_patch[hit.triangle]] != 0:
         return
     depth = raster.key_depth(key)
-    patch = scene.triangle_patch[candidate]
-    for dy in range(-1, 2):
-        for dx in range(-1, 2):
-            if dx == 0 and dy == 0:
-                continue
-            near_key = cell_key(target, x + dx, y + dy)
-            other = raster.key_triangle(near_key)
-            if other < 0 or other == drawn:
-                continue
-            other = parents[other]
-            if other == candidate:
-                continue
-            near_depth = raster.key_depth(near_key)
-            opposite = raster.key_depth(cell_key(target, x - dx, y - dy))
-            bend = near_depth - depth
-            if is_mirror(target, x - dx, y - dy) and opposite > 0.0:
-                # Only a rise counts: an opposite side that falls away is a farther surface.
-                bend = near_depth - depth - wp.max(depth - opposite, 0.0)
-            if bend > DEPTH_STEP * depth:
-                return
-            separate = scene.triangle_patch[other] != patch and near_depth > NEARER_SHARE * depth
-            if separate or bend > FINE_STEP * depth:
-                second = walk(scene, neighbours, point[i], direction[i], other, hop_count)
-                if second.triangle >= 0 and second.t < hit.t:
-                    if second.turned != 0:
-                        return
-                    hit = second
+    for k in range(4):
+        # The four opposite pairs: (1, 0), (-1, 1), (0, 1), (1, 1) and their negatives.
+        dx = wp.where(k == 0, 1, k - 2)
+        dy = wp.where(k == 0, 0, 1)
+        ahead = cell_key(target, cell, inside, x, y, dx, dy)
+        behind = cell_key(target, cell, inside, x, y, -dx, -dy)
+        depth_ahead = raster.key_depth(ahead)
+        depth_behind = raster.key_depth(behind)
+        for side in range(2):
+            near_key = wp.where(side == 0, ahead, behind)
+            near = wp.where(side == 0, depth_ahead, depth_behind)
+            far = wp.where(side == 0, depth_behind, depth_ahead)
+            if near_key != wp.uint64(0):
+                bend = rise(near, depth, far)
+                if bend > DEPTH_STEP * depth:
+                    return
+                other = raster.key_triangle(near_key)
+                separate = patches[other] != patch and near > NEARER_SHARE * depth
+                if separate or bend > FINE_STEP * depth:
+                    second = walk(scene, neighbours, point[i], direction[i], parents[other], hop_count)
+                    if second.triangle >= 0 and second.t < hit.t:
+                        if second.turned != 0:
+                            return
+                        hit = second
     out_triangle[i] = hit.triangle
     out_u[i] = hit.u
     out_v[i] = hit.v
@@ -205,7 +212,7 @@ def settle(
     gbuffer: GBuffer,
     pixels: MirrorPixels,
     target: raster.Target,
-    parents: wp.array,
+    mesh: VirtualMesh,
     layer: ReflectionLayer,
     settings: Settings,
     trust_sky: bool,
@@ -214,7 +221,7 @@ def settle(
 
     Args:
         target: The reflector's virtual z-buffer over `pixels.box`, ids are virtual triangles.
-        parents: int32, the scene triangle of each virtual triangle.
+        mesh: What was drawn.
         layer: Receives triangle, u, v, distance, status of the settled pixels, and their counts.
         trust_sky: No virtual triangle was dropped: an empty neighbourhood is sky.
 
@@ -230,7 +237,8 @@ def settle(
             scene.neighbours,
             scene.closed_patches,
             target.view,
-            parents,
+            mesh.parents,
+            mesh.patches,
             pixels.pixel,
             pixels.point,
             pixels.direction,

@@ -714,7 +714,7 @@ def reflect(
         launch(
             boundary_kernel,
             len(edges),
-            [points, prepared.map.view, frame, edges, forward.BOUNDARY_STEPS, out_point],
+            [points, prepared.map.view, frame, edges, forward.BOUNDARY_STEPS[settings.refine], out_point],
             scene.device,
             settings.threads,
         )

@@ -37,6 +37,7 @@ class VirtualMesh:
         points: vec3 [vertex_count], scene frame; the scene's own vertices first.
         triangles: vec3i [triangle_count], without the mirror's own and without those that were cut.
         parents: int32 [triangle_count], the scene triangle each belongs to.
+        patches: int32 [triangle_count], the scene patch each belongs to.
         cuts: uint8 [scene triangle_count], pieces along an edge, 1 where whole.
         relaxed: Multiple of the tolerance asked that the cuts were made for, 1 unless the budget was short.
     """
@@ -44,6 +45,7 @@ class VirtualMesh:
     points: wp.array
     triangles: wp.array
     parents: wp.array
+    patches: wp.array
     host_triangles: np.ndarray
     host_parents: np.ndarray
     base_count: int
@@ -102,11 +104,11 @@ def cut_kernel(
             and top - margin <= box[3]
         )
         if seen:
-            # Pieces smaller than a pixel bend nothing; the picture of a partly hidden triangle may be larger than known.
+            # Pieces of two pixels bend by less than one; the picture of a partly hidden triangle may be larger than known.
             extent = wp.max(right - left, bottom - top)
             if seen_corners < 3:
                 extent = float(CUT_MAX)
-            while pieces < CUT_MAX and float(pieces) < extent and longest > shortest * float(pieces):
+            while pieces < CUT_MAX and 2.0 * float(pieces) < extent and longest > shortest * float(pieces):
                 pieces = pieces * 2
     out_cut[i] = wp.uint8(pieces)
 
@@ -171,6 +173,7 @@ def cut_mesh(scene: Scene, part: PartRange, cuts: np.ndarray, relaxed: float) ->
         wp.array(np.concatenate(points), dtype=wp.vec3, device=device),
         wp.array(host_triangles, dtype=wp.vec3i, device=device),
         wp.array(host_parents, dtype=int, device=device),
+        wp.array(scene.host_triangle_patch[host_parents], dtype=int, device=device),
         host_triangles,
         host_parents,
         scene.vertex_count,
