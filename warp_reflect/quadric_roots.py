@@ -71,7 +71,7 @@ def pencil_resultant(
     c: wp.float64,
     equal: int,
 ):
-    """F(mu), cleared of its poles, and E2 as (a2, b2, c2): a2 t^2 + b2 t + c2."""
+    """F(mu), cleared of its poles, and the coefficients of E1 and E2: a t^2 + b t + c."""
     one = wp.float64(1.0)
     two = wp.float64(2.0)
     w0 = one + mu * a[0]
@@ -99,7 +99,7 @@ def pencil_resultant(
         clear = clear * w0
     if equal < 3:
         clear = clear * w2 * w2
-    return f * clear * clear, wp.vec3d(a2, b2, c2)
+    return f * clear * clear, wp.vec3d(a1, b1, c1), wp.vec3d(a2, b2, c2)
 
 
 @wp.func
@@ -294,34 +294,33 @@ class Pencil:
 def resultant_at(pencil: Pencil, x: wp.float64):
     """F at parameter x of the interval."""
     mu = scan_node(x, pencil.low, pencil.high)
-    f, _e2 = pencil_resultant(mu, pencil.o, pencil.v, pencil.d, pencil.a, pencil.b, pencil.c, pencil.equal)
+    f, _e1, _e2 = pencil_resultant(mu, pencil.o, pencil.v, pencil.d, pencil.a, pencil.b, pencil.c, pencil.equal)
     return f
 
 
 @wp.func
 def add_candidates(found: Roots, count: int, pencil: Pencil, x: wp.float64):
-    """Polish both points of the pencil at x that fulfil E2; keep what becomes a new root."""
+    """Polish the points of the pencil at x that fulfil E1 or E2; keep what becomes a new root."""
     zero = wp.float64(0.0)
     one = wp.float64(1.0)
     mu = scan_node(x, pencil.low, pencil.high)
-    _f, e2 = pencil_resultant(mu, pencil.o, pencil.v, pencil.d, pencil.a, pencil.b, pencil.c, pencil.equal)
-    # E2 gives t well also where the line through the pencil touches the surface (E1) or eye and target meet.
-    a2 = e2[0]
-    hb = wp.float64(0.5) * e2[1]
-    c2 = e2[2]
-    # A root that touches: the pair may have become complex by rounding, its real part still starts Newton.
-    disc = wp.sqrt(wp.max(hb * hb - a2 * c2, zero))
-    k = -hb - wp.where(hb < zero, -disc, disc)
-    t_first = -one
-    t_second = -one
-    if a2 != zero:
-        t_first = k / a2
-    if k != zero:
-        t_second = c2 / k
-    for j in range(2):
-        t = t_first
-        if j == 1:
-            t = t_second
+    _f, e1, e2 = pencil_resultant(mu, pencil.o, pencil.v, pencil.d, pencil.a, pencil.b, pencil.c, pencil.equal)
+    # E1 alone is ill-placed where the pencil's line touches the surface or eye and target meet, E2 alone where eye
+    # and target are mirror images: both give starts, and what is no root falls out.
+    for j in range(4):
+        e = e1
+        if j > 1:
+            e = e2
+        hb = wp.float64(0.5) * e[1]
+        # A pair that touches may have become complex by rounding; its real part still starts Newton.
+        disc = wp.sqrt(wp.max(hb * hb - e[0] * e[2], zero))
+        k = -hb - wp.where(hb < zero, -disc, disc)
+        t = -one
+        if j % 2 == 0:
+            if e[0] != zero:
+                t = k / e[0]
+        elif k != zero:
+            t = e[2] / k
         if t > -T_SLACK and t < one + T_SLACK:
             w = pencil.v + t * pencil.d
             start = wp.vec3d(

@@ -32,6 +32,7 @@ from warp_reflect.solve_device import (
     near_limit,
     refuse,
     to_double,
+    unit_scale,
     write_answer,
     write_root,
 )
@@ -148,10 +149,14 @@ def solve_convex_kernel(
         return
     eye = view.unit_from_world * (eye_world - view.origin)
     target = view.unit_from_world * (target_world - view.origin)
+    scale = unit_scale(eye, target, view)
+    size = view.size * scale
+    eye = eye / scale
+    target = target / scale
     near = zero
     usable = int(0)
     if warm != 0:
-        s = view.unit_from_world * (to_double(start[row]) - view.origin)
+        s = view.unit_from_world * (to_double(start[row]) - view.origin) / scale
         if finite(s):
             usable = int(1)
             near = type(zero)(zero.dtype(s[0]), zero.dtype(s[1]), zero.dtype(s[2]))
@@ -170,7 +175,9 @@ def solve_convex_kernel(
                 best = other
                 other = swap
             if out_roots.shape[1] > 1:
-                write_root(zero, other, 1, 0, view, row, out_roots, out_root_length, out_root_index, out_root_status)
+                write_root(
+                    zero, other, 1, 0, view, size, row, out_roots, out_root_length, out_root_index, out_root_status
+                )
                 out_root_count[row] = 1
         elif has_point(other.status):
             best = other
@@ -178,9 +185,9 @@ def solve_convex_kernel(
             best.status = worse_status(best.status, other.status)
     out_status[row] = wp.uint8(best.status)
     if has_point(best.status):
-        write_answer(zero, best, view, row, out_point, out_normal, out_virtual, out_residual)
+        write_answer(zero, best, view, size, row, out_point, out_normal, out_virtual, out_residual)
         if out_roots.shape[1] > 0:
-            write_root(zero, best, 0, 0, view, row, out_roots, out_root_length, out_root_index, out_root_status)
+            write_root(zero, best, 0, 0, view, size, row, out_roots, out_root_length, out_root_index, out_root_status)
             out_root_count[row] = out_root_count[row] + 1
 
 

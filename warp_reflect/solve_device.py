@@ -32,6 +32,7 @@ OUT_OF_EXTENT = wp.constant(int(Status.OUT_OF_EXTENT))
 
 TOUCHING = wp.constant(4.0)  # roundings of a unit coordinate within which a point is on the surface
 SLACK = wp.constant(64.0)  # roundings of the terms of the angle within which it is 0
+MOST_SLACK = wp.constant(0.1)  # a sine that no rounding excuses
 
 
 @wp.func
@@ -87,15 +88,23 @@ def signed_distance(x: wp.vec3d, lam: wp.vec3d, b: wp.float64, c: wp.float64):
 @wp.func
 def chord_enters(eye: wp.vec3d, target: wp.vec3d, lam: wp.vec3d, b: wp.float64, c: wp.float64, sheet: int):
     """True if the segment between outsiders enters the body (sheet != 0: its part with that sign of z)."""
+    zero = wp.float64(0.0)
     d = target - eye
     aa = quadric_curve(d, d, lam)
-    hb = wp.dot(quadric_half_gradient(eye, lam, b), d)
-    cc = quadric_value(eye, lam, b, c)
-    if not (aa > wp.float64(0.0)) or not (hb < wp.float64(0.0)) or not (hb + aa > wp.float64(0.0)):
+    if not (aa > zero):
         return False
-    if hb * hb <= aa * cc:
+    if not (wp.dot(quadric_half_gradient(eye, lam, b), d) < zero):
         return False
-    return sheet == 0 or (eye[2] - (hb / aa) * d[2]) * wp.float64(sheet) > wp.float64(0.0)
+    if not (wp.dot(quadric_half_gradient(target, lam, b), d) > zero):
+        return False
+    # q where it is least on the segment, reached from the nearer end: a discriminant would lose a far eye's digits.
+    p = eye
+    if wp.dot(target, target) < wp.dot(eye, eye):
+        p = target
+    p = p - (wp.dot(quadric_half_gradient(p, lam, b), d) / aa) * d
+    if not (quadric_value(p, lam, b, c) < zero):
+        return False
+    return sheet == 0 or p[2] * wp.float64(sheet) > zero
 
 
 @wp.func
@@ -193,7 +202,7 @@ def judge(
     cosine = wp.dot(to_eye, n) / l_eye
     # The half vector shrinks with the cosine, the rounding of its two parts does not.
     slack = wp.float64(SLACK) * roundoff * (one + scale * (bend + one / l_eye + one / l_target))
-    slack = slack / wp.max(cosine, grazing)
+    slack = wp.min(slack / wp.max(cosine, grazing), wp.float64(MOST_SLACK))
     found.status = CONVERGED
     if cosine < grazing:
         found.status = GRAZING
@@ -253,18 +262,30 @@ def has_point(status: int):
 
 
 @wp.func
+def unit_scale(eye: wp.vec3d, target: wp.vec3d, view: QuadricView):
+    """Further scale of the unit frame for one pair: a cone has no size of its own, the nearer end gives it."""
+    scale = wp.float64(1.0)
+    if view.c == wp.float64(0.0) and view.b == wp.float64(0.0):
+        nearer = wp.min(safe_length(eye), safe_length(target))
+        if nearer > wp.float64(0.0):
+            scale = nearer
+    return scale
+
+
+@wp.func
 def write_answer(
     zero: Any,
     found: Found,
     view: QuadricView,
+    size: wp.float64,
     row: int,
     out_point: wp.array(dtype=Any),
     out_normal: wp.array(dtype=Any),
     out_virtual: wp.array(dtype=Any),
     out_residual: wp.array(dtype=Any),
 ):
-    p = view.origin + view.size * (view.axes * found.point)
-    v = view.origin + view.size * (view.axes * found.image)
+    p = view.origin + size * (view.axes * found.point)
+    v = view.origin + size * (view.axes * found.image)
     n = view.axes * found.normal
     out_point[row] = type(zero)(zero.dtype(p[0]), zero.dtype(p[1]), zero.dtype(p[2]))
     out_virtual[row] = type(zero)(zero.dtype(v[0]), zero.dtype(v[1]), zero.dtype(v[2]))
@@ -279,14 +300,15 @@ def write_root(
     slot: int,
     index: int,
     view: QuadricView,
+    size: wp.float64,
     row: int,
     out_roots: wp.array2d(dtype=Any),
     out_root_length: wp.array2d(dtype=Any),
     out_root_index: wp.array2d(dtype=wp.uint8),
     out_root_status: wp.array2d(dtype=wp.uint8),
 ):
-    p = view.origin + view.size * (view.axes * found.point)
+    p = view.origin + size * (view.axes * found.point)
     out_roots[row, slot] = type(zero)(zero.dtype(p[0]), zero.dtype(p[1]), zero.dtype(p[2]))
-    out_root_length[row, slot] = zero.dtype(view.size * found.length)
+    out_root_length[row, slot] = zero.dtype(size * found.length)
     out_root_index[row, slot] = wp.uint8(index)
     out_root_status[row, slot] = wp.uint8(found.status)

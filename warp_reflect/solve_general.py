@@ -28,6 +28,7 @@ from warp_reflect.solve_device import (
     signed_distance,
     to_double,
     touch,
+    unit_scale,
     write_answer,
     write_root,
 )
@@ -70,6 +71,10 @@ def solve_general_kernel(
     # The scan works in float64 whatever the points are: its polynomial is beyond float32.
     eye = view.unit_from_world * (eye_world - view.origin)
     target = view.unit_from_world * (target_world - view.origin)
+    scale = unit_scale(eye, target, view)
+    size = view.size * scale
+    eye = eye / scale
+    target = target / scale
     roundoff = wp.float64(unit_roundoff(zero[0]))
     a = view.sign * view.lam
     b = view.sign * view.b
@@ -96,14 +101,16 @@ def solve_general_kernel(
         if best.status == CONVERGED:
             best_rank = 0
             if out_roots.shape[1] > 0:
-                write_root(zero, best, 0, 0, view, row, out_roots, out_root_length, out_root_index, out_root_status)
+                write_root(
+                    zero, best, 0, 0, view, size, row, out_roots, out_root_length, out_root_index, out_root_status
+                )
             count = 1
         else:
             best = Found()
     e = cut_far(eye, far)
     t = cut_far(target, far)
     if warm != 0 and count == 0:
-        s = view.unit_from_world * (to_double(start[row]) - view.origin)
+        s = view.unit_from_world * (to_double(start[row]) - view.origin) / scale
         if finite(s):
             near = polish_root(s, e, t, a, b, c)
             there = view.sheet == 0 or near.point[2] * wp.float64(view.sheet) > wp.float64(0.0)
@@ -112,7 +119,7 @@ def solve_general_kernel(
                 best = judge(near.point, eye, target, a, b, roundoff, grazing_limit(zero[0]))
                 if best.status == CONVERGED:
                     out_status[row] = wp.uint8(CONVERGED)
-                    write_answer(zero, best, view, row, out_point, out_normal, out_virtual, out_residual)
+                    write_answer(zero, best, view, size, row, out_point, out_normal, out_virtual, out_residual)
                     return
                 best = Found()
     found, root_count = all_reflections(e, t, a, b, c, view.equal, view.sheet)
@@ -136,6 +143,7 @@ def solve_general_kernel(
                 count,
                 index,
                 view,
+                size,
                 row,
                 out_roots,
                 out_root_length,
@@ -159,7 +167,7 @@ def solve_general_kernel(
             out_status[row] = wp.uint8(UNREFLECTED)
         return
     out_status[row] = wp.uint8(best.status)
-    write_answer(zero, best, view, row, out_point, out_normal, out_virtual, out_residual)
+    write_answer(zero, best, view, size, row, out_point, out_normal, out_virtual, out_residual)
 
 
 for _vector, _scalar in ((wp.vec3, wp.float32), (wp.vec3d, wp.float64)):

@@ -41,6 +41,11 @@ def solve_plane_kernel(
     out_virtual: wp.array(dtype=Any),
     out_residual: wp.array(dtype=Any),
     out_status: wp.array(dtype=wp.uint8),
+    out_root_count: wp.array(dtype=int),
+    out_roots: wp.array2d(dtype=Any),
+    out_root_length: wp.array2d(dtype=Any),
+    out_root_index: wp.array2d(dtype=wp.uint8),
+    out_root_status: wp.array2d(dtype=wp.uint8),
 ):
     """One thread per pair of eye and point."""
     row = first + wp.tid()
@@ -85,6 +90,12 @@ def solve_plane_kernel(
     out_virtual[row] = type(zero)(zero.dtype(v[0]), zero.dtype(v[1]), zero.dtype(v[2]))
     out_residual[row] = zero.dtype(residual)
     out_status[row] = wp.uint8(status)
+    if out_roots.shape[1] > 0 and status != OUT_OF_EXTENT:
+        out_root_count[row] = 1
+        out_roots[row, 0] = out_point[row]
+        out_root_length[row, 0] = zero.dtype(wp.length(v - eye_world))
+        out_root_index[row, 0] = wp.uint8(0)
+        out_root_status[row, 0] = wp.uint8(status)
 
 
 for _vector, _scalar in ((wp.vec3, wp.float32), (wp.vec3d, wp.float64)):
@@ -96,5 +107,7 @@ for _vector, _scalar in ((wp.vec3, wp.float32), (wp.vec3d, wp.float64)):
             "out_normal": wp.array(dtype=_vector),
             "out_virtual": wp.array(dtype=_vector),
             "out_residual": wp.array(dtype=_scalar),
+            "out_roots": wp.array2d(dtype=_vector),
+            "out_root_length": wp.array2d(dtype=_scalar),
         },
     )

@@ -21,6 +21,7 @@ from warp_reflect.solve_device import (
     near_limit,
     refuse,
     to_double,
+    unit_scale,
     write_answer,
 )
 
@@ -52,6 +53,10 @@ def solve_qim_kernel(
         return
     eye = view.unit_from_world * (eye_world - view.origin)
     target = view.unit_from_world * (target_world - view.origin)
+    scale = unit_scale(eye, target, view)
+    size = view.size * scale
+    eye = eye / scale
+    target = target / scale
     roundoff = wp.float64(unit_roundoff(zero[0]))
     sheet = view.sheet
     if view.family == 2 and sheet == 0:
@@ -95,9 +100,9 @@ def solve_qim_kernel(
             r = wp.vec3d(wp.float64(p[0]), wp.float64(p[1]), flip * wp.float64(p[2]))
             # A minimum is resolved to the root of the rounding.
             found = judge(r, eye, target, view.lam, view.b, wp.sqrt(roundoff), grazing_limit(zero[0]))
-            write_answer(zero, found, view, row, out_point, out_normal, out_virtual, out_residual)
+            write_answer(zero, found, view, size, row, out_point, out_normal, out_virtual, out_residual)
     elif found.status == CONVERGED:
-        write_answer(zero, found, view, row, out_point, out_normal, out_virtual, out_residual)
+        write_answer(zero, found, view, size, row, out_point, out_normal, out_virtual, out_residual)
     out_status[row] = wp.uint8(found.status)
 
 

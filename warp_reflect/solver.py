@@ -313,6 +313,7 @@ def _(mirror: PlanarMirror, request: Request) -> Answer:
     half_width, half_height = mirror.extent or (0.0, 0.0)
     frame = [wp.vec3d(x) for x in (mirror.point, mirror.normal, mirror.width_axis, mirror.height_axis)]
     outputs = [answer.point, answer.normal, answer.virtual, answer.residual, answer.status]
+    outputs += [answer.root_count, answer.roots, answer.root_length, answer.root_index, answer.root_status]
     inputs = [request.eyes, request.points, *frame, wp.float64(half_width), wp.float64(half_height), *outputs]
     launch(solve_plane_kernel, request.count, inputs, request.points.device, request.threads)
     return answer
