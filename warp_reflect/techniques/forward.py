@@ -335,10 +335,22 @@ def _cut_where_bent(
         cuts[part.first_triangle : part.first_triangle + part.triangle_count] = 1
         return cuts
 
-    if (cuts_for(mesh.relaxed) <= mesh.cuts).all():
+    if (cuts_for(mesh.relaxed) <= mesh.estimated).all():
         return mesh, vertices
-    cuts, relaxed = virtual_mesh.within_budget(lambda m: cuts_for(m / virtual_mesh.CUT_SLACK), scene)
-    finer = virtual_mesh.cut_mesh(scene, part, np.maximum(cuts, 1), relaxed)
+    estimated = cuts_for(1.0 / virtual_mesh.CUT_SLACK)
+    ids = np.flatnonzero(estimated > 1)
+    middle_points = wp.array(virtual_mesh.edge_middles(scene, ids), dtype=wp.vec3, device=scene.device)
+    middles = empty_vertices(len(middle_points), scene.device)
+    solve_vertices(middle_points, False, frame, False, middles)
+    cuts, relaxed = np.ones(scene.triangle_count, np.uint8), 1.0
+    for _ in range(virtual_mesh.RELAX_STEPS):
+        allowed_px = settings.edge_px * relaxed / virtual_mesh.CUT_SLACK
+        upper = estimated[ids] if relaxed == 1.0 else cuts_for(relaxed / virtual_mesh.CUT_SLACK)[ids]
+        cuts[ids] = virtual_mesh.measured_cuts(scene, ids, upper, vertices, middles, allowed_px)
+        if virtual_mesh.triangle_cost(cuts) <= virtual_mesh.budget(scene):
+            break
+        relaxed *= virtual_mesh.RELAX
+    finer = virtual_mesh.cut_mesh(scene, part, cuts, estimated, relaxed)
     known = empty_vertices(finer.vertex_count, scene.device)
     base = mesh.base_count
     added = VertexView()

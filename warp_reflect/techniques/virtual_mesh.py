@@ -21,6 +21,7 @@ wp.set_module_options({"enable_backward": False})
 
 CONVERGED = wp.constant(int(Status.CONVERGED))
 CUT_MAX = wp.constant(32)  # pieces along an edge; a lattice of 32 has 1024 triangles
+STRADDLING_MAX = 4  # pieces of a triangle that is partly hidden: the estimate grows without bound at grazing incidence
 CUT_SLACK = 1.5  # the tolerance is divided by it when cutting, so that a moving eye does not cut anew every frame
 BUDGET_SHARE = 2.0  # new triangles per triangle of the scene (beside BUDGET_MIN) before the tolerance is relaxed
 BUDGET_MIN = 20000
@@ -38,8 +39,8 @@ class VirtualMesh:
         triangles: vec3i [triangle_count], without the mirror's own and without those that were cut.
         parents: int32 [triangle_count], the scene triangle each belongs to.
         patches: int32 [triangle_count], the scene patch each belongs to.
-        cuts: uint8 [scene triangle_count], pieces along an edge, 1 where whole.
-        relaxed: Multiple of the tolerance asked that the cuts were made for, 1 unless the budget was short.
+        estimated: uint8 [scene triangle_count], pieces along an edge by the estimate that was in force, 1 where whole.
+        relaxed: Multiple of the tolerance asked that it was made for, 1 unless the budget was short.
     """
 
     points: wp.array
@@ -49,7 +50,7 @@ class VirtualMesh:
     host_triangles: np.ndarray
     host_parents: np.ndarray
     base_count: int
-    cuts: np.ndarray
+    estimated: np.ndarray
     relaxed: float
 
     @property
@@ -129,26 +130,53 @@ def needed_cuts(scene: Scene, vertices, unit_per_scene: float, tolerance: float,
 
 def whole(scene: Scene, part: PartRange) -> VirtualMesh:
     """The scene without the mirror, nothing cut."""
-    return cut_mesh(scene, part, np.ones(scene.triangle_count, np.uint8), 1.0)
+    ones = np.ones(scene.triangle_count, np.uint8)
+    return cut_mesh(scene, part, ones, ones, 1.0)
 
 
-def within_budget(cuts_for, scene: Scene) -> tuple[np.ndarray, float]:
-    """Cuts for the tolerance, or for the smallest multiple of it whose triangles fit the budget, and that multiple.
+def edge_middles(scene: Scene, ids: np.ndarray) -> np.ndarray:
+    """Middles of the edges of scene triangles, float32 [3 len(ids), 3], edge by edge (v0v1, v1v2, v2v0)."""
+    corner = scene.host_points[scene.host_triangles[ids]]
+    return (0.5 * (corner + corner[:, [1, 2, 0]])).transpose(1, 0, 2).reshape(-1, 3)
+
+
+def measured_cuts(
+    scene: Scene, ids: np.ndarray, estimate: np.ndarray, vertices, middles, tolerance_px: float
+) -> np.ndarray:
+    """Pieces per triangle from how far the picture of each edge's middle lies off the straight edge.
+
+    The deviation falls with the square of the pieces. Where a corner or a middle has no picture
+    (behind the mirror's silhouette, which compresses it) the estimate stands up to STRADDLING_MAX.
 
     Args:
-        cuts_for: (multiple of the tolerance) -> cuts.
+        ids: Scene triangles asked.
+        estimate: Their pieces by `needed_cuts`, the upper bound.
+        vertices, middles: Solved vertices of the scene, and of `edge_middles`.
+        tolerance_px: Deviation allowed. [pixels]
     """
-    budget = BUDGET_MIN + BUDGET_SHARE * scene.triangle_count
-    relaxed = 1.0
-    for _ in range(RELAX_STEPS):
-        cuts = cuts_for(relaxed)
-        if float((cuts.astype(np.int64) ** 2 * (cuts > 1)).sum()) <= budget:
-            return cuts, relaxed
-        relaxed *= RELAX
-    return np.ones_like(cuts), relaxed
+    screen = vertices.screen.numpy()[scene.host_triangles[ids]][..., :3].astype(np.float64)
+    middle = middles.screen.numpy()[..., :3].reshape(3, len(ids), 3).astype(np.float64).transpose(1, 0, 2)
+    seen = (screen[..., 2] > 0.0).all(axis=1) & (middle[..., 2] > 0.0).all(axis=1)
+    along = screen[:, [1, 2, 0], :2] - screen[..., :2]
+    off = middle[..., :2] - screen[..., :2]
+    length = np.maximum(np.linalg.norm(along, axis=2), 1.0)
+    deviation = (np.abs(along[..., 0] * off[..., 1] - along[..., 1] * off[..., 0]) / length).max(axis=1)
+    wanted = np.sqrt(np.maximum(deviation / tolerance_px, 1.0))
+    pieces = 2.0 ** np.ceil(np.log2(wanted))
+    return np.minimum(np.where(seen, pieces, STRADDLING_MAX), estimate).astype(np.uint8)
 
 
-def cut_mesh(scene: Scene, part: PartRange, cuts: np.ndarray, relaxed: float) -> VirtualMesh:
+def triangle_cost(cuts: np.ndarray) -> float:
+    """Triangles that cuts add."""
+    return float((cuts.astype(np.int64) ** 2 * (cuts > 1)).sum())
+
+
+def budget(scene: Scene) -> float:
+    """Triangles that may be added to a scene."""
+    return BUDGET_MIN + BUDGET_SHARE * scene.triangle_count
+
+
+def cut_mesh(scene: Scene, part: PartRange, cuts: np.ndarray, estimated: np.ndarray, relaxed: float) -> VirtualMesh:
     """Replace every triangle with cuts > 1 by its lattice; drop the mirror's own."""
     own = slice(part.first_triangle, part.first_triangle + part.triangle_count)
     cuts = cuts.copy()
@@ -177,7 +205,7 @@ def cut_mesh(scene: Scene, part: PartRange, cuts: np.ndarray, relaxed: float) ->
         host_triangles,
         host_parents,
         scene.vertex_count,
-        cuts,
+        estimated,
         relaxed,
     )
 
