@@ -470,6 +470,9 @@ def surface_distance(x: Any, lam: Any, b: Any, c: Any, family: int):
     q = quadric_value(x, lam, b, c)
     if family == 0:
         return q / (wp.sqrt(q + x.dtype(1.0)) + x.dtype(1.0))
+    if family == 2 and x[2] < x.dtype(0.0):
+        # Below the centre q belongs to the other part.
+        return wp.length(x)
     n = quadric_half_gradient(x, lam, b)
     return q / (wp.length(n) + wp.sqrt(wp.dot(n, n) + q))
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import warp as wp
 
+from warp_reflect.optics import safe_normalize
 from warp_reflect.quadrics import (
     bracket_on_convex,
     first_guess,
@@ -19,6 +20,7 @@ from warp_reflect.quadrics import (
 )
 from warp_reflect.solve_device import (
     BAD_INPUT,
+    DEGENERATE,
     HIDDEN,
     INSIDE,
     NONE,
@@ -41,6 +43,8 @@ from warp_reflect.solve_device import (
 wp.set_module_options({"enable_backward": False, "max_unroll": 2})
 
 NEWTON_STEPS = wp.constant(12)  # evaluations before the bracketed search takes over
+FINE_COSINE = wp.constant(0.2)  # of 78 degrees: beyond, float32 loses a digit and more
+FINE_STEPS = wp.constant(4)
 GUESS_STEPS = wp.constant(4)  # Newton steps of the first foot point; more do not pay
 
 
@@ -73,11 +77,15 @@ def search_convex(
     bend = (s_lam[0] + s_lam[1] + wp.abs(s_lam[2])) / wp.length(n)
     reach = near.dtype(1.0) / wp.length(s_eye - r) + near.dtype(1.0) / wp.length(s_target - r)
     good = tolerance * near.dtype(4.0) * (near.dtype(1.0) + (near.dtype(1.0) + wp.length(r)) * (bend + reach))
+    fine = wp.float64(6.0) * unit_roundoff(b)
     if not (angle <= wp.min(good, near.dtype(1.0e-2))):
         result = bracket_on_convex(eye, target, lam, b, c, family)
         if wp.length(quadric_half_gradient(result, lam, b)) > wp.float64(1.0e-9):
-            fine = wp.float64(6.0) * unit_roundoff(b)
             result, _angle = newton_on_convex(result, eye, target, lam, b, c, family, NEWTON_STEPS, fine)
+    elif wp.dot(n, s_eye - r) < near.dtype(FINE_COSINE) * wp.length(n) * wp.length(s_eye - r):
+        # The error grows with 1 / cosine; a step or two in float64 leave that of the input alone.
+        result = put_on_surface(result, lam, b, c, family)
+        result, _angle = newton_on_convex(result, eye, target, lam, b, c, family, FINE_STEPS, fine)
     return result
 
 
@@ -95,6 +103,13 @@ def solve_sheet(
     e = wp.vec3d(eye[0], eye[1], flip * eye[2])
     t = wp.vec3d(target[0], target[1], flip * target[2])
     s = type(near)(near[0], near[1], near.dtype(flip) * near[2])
+    if view.family == 2 and view.c == wp.float64(0.0):
+        # The apex of a cone is the shortest way iff the half vector there lies among its normals, the polar cone.
+        w = safe_normalize(e) + safe_normalize(t)
+        across = w[0] * w[0] / view.lam[0] + w[1] * w[1] / view.lam[1]
+        if w[2] <= wp.float64(0.0) and across <= -w[2] * w[2] / view.lam[2]:
+            found.status = DEGENERATE
+            return found
     far = near_limit(near[0])
     usable = int(warm)
     if sheet != 0 and not (s[2] > near.dtype(0.0)):
