@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 
 from warp_reflect import raster
+from warp_reflect.bvh import FINITE_FLAGS
 from warp_reflect.launch import launch
 from warp_reflect.layers import GBuffer, MirrorPixels, ReflectionLayer
 from warp_reflect.scene import Scene, SceneView
@@ -19,7 +20,7 @@ from warp_reflect.settings import Settings, Status
 from warp_reflect.shapes import clamp_weights, intersect_triangle
 from warp_reflect.techniques.virtual_mesh import VirtualMesh
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FINITE_FLAGS})
 
 CONVERGED = wp.constant(int(Status.CONVERGED))
 SKY = wp.constant(int(Status.SKY))
@@ -36,7 +37,7 @@ DEPTH_STEP = wp.constant(0.01)
 # Of the depth key: a smaller rise may be a step of the same mesh (a tile over its joint); its triangle is tested.
 FINE_STEP = wp.constant(2.0e-4)
 # Candidates of another patch at nearly the same depth (a label on a bottle) are tested too and the nearer hit is taken.
-NEARER_SHARE = wp.constant(0.98)
+NEARER_SHARE = wp.constant(0.995)
 
 
 @wp.struct
@@ -175,6 +176,7 @@ def settle_kernel(
     if hit.from_behind != 0 and closed[scene.triangle_patch[hit.triangle]] != 0:
         return
     depth = raster.key_depth(key)
+    tested = int(-1)
     for k in range(4):
         # The four opposite pairs: (1, 0), (-1, 1), (0, 1), (1, 1) and their negatives.
         dx = wp.where(k == 0, 1, k - 2)
@@ -193,7 +195,8 @@ def settle_kernel(
                     return
                 other = raster.key_triangle(near_key)
                 separate = patches[other] != patch and near > NEARER_SHARE * depth
-                if separate or bend > FINE_STEP * depth:
+                if other != tested and (separate or bend > FINE_STEP * depth):
+                    tested = other
                     second = walk(scene, neighbours, point[i], direction[i], parents[other], hop_count)
                     if second.triangle >= 0 and second.t < hit.t:
                         if second.turned != 0:

@@ -52,6 +52,10 @@ MIDPOINT_DELTA = wp.constant(0.5)  # |b_m - b| / |b| steered to; best factor per
 CONVERGED = wp.constant(int(Status.CONVERGED))
 HIDDEN = wp.constant(int(Status.HIDDEN))
 MAX_ITERATIONS = wp.constant(int(Status.MAX_ITERATIONS))
+# Pixels. Virtual positions of a cell whose interpolation is estimated to be wrong by more are not interpolated: a cell as
+# large as the mirror would say nothing. The paper's own grids are wrong by about as much.
+GRID_POSITION_PX = 4.0
+SPACE_DIAGONAL = wp.constant(1.7320508)  # of a cube with edge 1
 EDGE_SINE_MAX = 0.3  # 17 degrees; facets of a coarse but smooth body stay below, the rim of a cylinder is far above
 GRAZING_COS = wp.constant(0.1)  # cosine of incidence below which a search without a root lies on the silhouette
 SEARCH_MIDPOINT = wp.constant(1)
@@ -459,7 +463,7 @@ def grid_kernel(
     # Grid:
     grid_view: GridView,
     node: VertexView,
-    interpolate_positions: int,
+    position_root: float,
     # Outputs:
     out_vertex: VertexView,
 ):
@@ -475,6 +479,7 @@ def grid_kernel(
     position = wp.vec3(0.0, 0.0, 0.0)
     solved = int(0)
     hidden = int(0)
+    shortest = float(1.0e30)
     if cell >= 0:
         local = grid_view.vertex_local[i]
         for k in range(8):
@@ -485,8 +490,9 @@ def grid_kernel(
                 weight = corner_weight(local, k)
                 seed = node.seed[corner]
                 x += weight * seed
-                if interpolate_positions != 0:
+                if position_root > 0.0:
                     position += weight * node.position[corner]
+                    shortest = wp.min(shortest, node.reach[corner])
             elif status == HIDDEN:
                 hidden += 1
     if hidden == 8:
@@ -495,14 +501,17 @@ def grid_kernel(
         out_vertex.screen[i] = wp.vec4(0.0, 0.0, -1.0, 0.0)
         return
     if solved == 8:
-        if interpolate_positions != 0:
+        first_corner = grid_view.nodes[grid_view.cell_nodes[cell, 0]]
+        last_corner = grid_view.nodes[grid_view.cell_nodes[cell, 7]]
+        diagonal = wp.length(frame.unit_from_scene * (last_corner - first_corner))
+        if position_root > 0.0 and diagonal < SPACE_DIAGONAL * shortest * position_root:
             out_vertex.status[i] = wp.uint8(CONVERGED)
             out_vertex.screen[i] = project(camera, position)
             return
         x = project_to_cube(x)
         sample = sample_map(map, x)
         r = measure(sample, x, frame.eye, target)
-        if r.residual < GRID_RESIDUAL_MAX:
+        if position_root == 0.0 and r.residual < GRID_RESIDUAL_MAX:
             x = step_on_cube(map, r, newton_step(sample, frame.eye, target), 1.0)
             # Read again: a tangent step leaves the body by its sagitta, which coarse cells make visible.
             sample = sample_map(map, x)
@@ -704,10 +713,11 @@ def reflect(
             launch(search_kernel, len(points), inputs, scene.device, settings.threads)
             return
         positions = settings.grid_kind == "position"
+        radians = GRID_POSITION_PX / max(camera.fx, camera.fy)
         node = forward.empty_vertices(cells.node_count, scene.device, with_position=positions)
         inputs = [cells.view.nodes, 0, 0, prepared.map.view, *common, 0, node]
         launch(search_kernel, cells.node_count, inputs, scene.device, settings.threads)
-        inputs = [points, *mirror, *common, cells.view, node, int(positions), out_vertex]
+        inputs = [points, *mirror, *common, cells.view, node, float(np.sqrt(radians)) if positions else 0.0, out_vertex]
         launch(grid_kernel, len(points), inputs, scene.device, settings.threads)
 
     def solve_boundary(points, frame: SolveFrame, edges: wp.array, out_point: wp.array) -> None:

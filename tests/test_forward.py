@@ -1,0 +1,214 @@
+"""The forward pass on small scenes: planes against a mirrored eye, grids, warm starts, cutting, refinement."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import warp_reflect as wr
+from warp_reflect.layers import Camera
+from warp_reflect.scene import CameraData, InstanceData, MaterialData, MeshData, Part, Patch, Scene, SceneData, Shape
+from warp_reflect.settings import Status
+from warp_reflect.techniques import grid, virtual_mesh
+
+CHROME = MaterialData(base_color=(0.9, 0.9, 0.9), metallic=1.0, roughness=0.0)
+
+
+def placed(x, y, z, scale=1.0):
+    matrix = np.diag([scale, scale, scale, 1.0])
+    matrix[:3, 3] = x, y, z
+    return matrix
+
+
+def sphere(rows=24, columns=48):
+    theta, phi = np.meshgrid(
+        np.linspace(0, np.pi, rows + 1), np.linspace(0, 2 * np.pi, columns, endpoint=False), indexing="ij"
+    )
+    points = np.stack([np.sin(theta) * np.cos(phi), np.cos(theta), np.sin(theta) * np.sin(phi)], -1)
+    points[0], points[-1] = [0, 1, 0], [0, -1, 0]
+    points = points.reshape(-1, 3)
+    i = np.arange(rows * columns)
+    a, b = i, i // columns * columns + (i + 1) % columns
+    faces = np.concatenate([np.stack([a, b, a + columns], 1), np.stack([b, b + columns, a + columns], 1)])
+    p = points[faces]
+    faces = faces[np.linalg.norm(np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]), axis=1) > 1e-9]
+    return MeshData(
+        points.astype(np.float32),
+        faces.astype(np.int32),
+        points.astype(np.float32),
+        parts=[Part(0, len(faces), patches=(Patch(0, len(faces), Shape("quadric", np.eye(4), 1.0, 0.0, 1.0)),))],
+    )
+
+
+def square(cells, half):
+    u, v = np.meshgrid(np.linspace(-half, half, cells + 1), np.linspace(-half, half, cells + 1), indexing="ij")
+    points = np.stack([v, 0 * u, u], -1).reshape(-1, 3)
+    i = np.arange(cells * cells)
+    a = i // cells * (cells + 1) + i % cells
+    below = a + cells + 1
+    faces = np.concatenate([np.stack([a, below, a + 1], 1), np.stack([a + 1, below, below + 1], 1)])
+    return MeshData(points.astype(np.float32), faces.astype(np.int32), double_sided=True)
+
+
+def room(mirror, mirror_at, floor_cells=12):
+    """A mirror over a floor with balls around it; the camera looks down -Z."""
+    plain = dataclasses.replace(sphere(), parts=[])
+    instances = [InstanceData(0, mirror_at, "/mirror", (0,)), InstanceData(1, placed(0, -1, 0), "/floor", (1,))]
+    rng = np.random.default_rng(0)
+    for k in range(10):
+        x, z = rng.uniform(-3, 3, 2)
+        instances.append(InstanceData(2, placed(x, rng.uniform(-0.5, 1.5), z + 2, 0.3), f"/ball{k}", (1,)))
+    return Scene(
+        SceneData(
+            "room",
+            [mirror, square(floor_cells, 6.0), plain],
+            instances,
+            [CHROME, MaterialData()],
+            [],
+            [CameraData("/camera", placed(0.1, 0.3, 4.0), near=0.05, focal_length=22.0)],
+        )
+    )
+
+
+@pytest.fixture(scope="module")
+def ball_room():
+    return room(sphere(), placed(0, 0, -1))
+
+
+def render(scene, method, previous=None, size=(160, 90), camera=None, **settings):
+    plan = wr.make_plan(scene, size=size, settings=wr.Settings(**settings), method=method)
+    return wr.render_frame(scene, plan, camera=camera, previous=previous)
+
+
+def identical(a, b):
+    comparison = wr.compare_frames(a, b)
+    assert comparison.interior_pixels > 500
+    return comparison.share(comparison.identical)
+
+
+def plane_room():
+    """A wall-sized plane at z = -2 that faces +Z."""
+    turn = np.eye(4)
+    turn[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
+    turn[2, 3] = -2.0
+    return room(square(2, 2.5), turn)
+
+
+def test_planar_without_refinement_equals_the_reference():
+    scene = plane_room()
+    frame = render(scene, "planar", refine="off")
+    assert {row.technique for row in frame.plan.rows} == {"planar"}
+    assert identical(frame, render(scene, "reference")) > 0.999
+
+
+def test_planar_equals_the_picture_of_a_mirrored_eye():
+    """What a plane at z = -2 shows is what an eye behind it sees, flipped: other code draws that picture."""
+    scene = plane_room()
+    frame = render(scene, "planar")
+    camera = frame.camera
+    flip = np.array([1.0, 1.0, -1.0])
+    behind = Camera(
+        eye=camera.eye * flip - [0, 0, 4],
+        right=camera.right * flip,
+        up=camera.up * flip,
+        forward=camera.forward * flip,
+        fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy, near=6.05, far=camera.far, size=camera.size,
+    )  # fmt: skip
+    direct = render(scene, "planar", camera=behind)
+    mirror = frame["reflectorId"] > 0
+    same = frame["reflectedId"][mirror] == np.where(direct["primId"][mirror] == 1, 0, direct["primId"][mirror])
+    assert same.mean() > 0.995
+
+
+def test_plane_seen_edge_on_or_from_its_plane_is_finite():
+    scene = plane_room()
+    camera = wr.make_plan(scene, size=(64, 36)).camera
+    for z in (-2.0, -2.0 + 1e-9, -2.5):
+        frame = render(scene, "planar", size=(64, 36), camera=dataclasses.replace(camera, eye=np.array([0, 0.3, z])))
+        assert all(np.isfinite(frame[name]).all() for name in frame.keys())
+
+
+@pytest.mark.parametrize("settings", [{}, {"grid_share": 0.1}, {"grid_share": 0.1, "grid_kind": "position"}])
+def test_refined_frame_equals_the_reference(ball_room, settings):
+    assert identical(render(ball_room, "reflector_map", **settings), render(ball_room, "reference")) >= 0.999
+
+
+def test_grid_of_directions_beats_grid_of_positions(ball_room):
+    """The same cells, without refinement: one exact step a vertex leaves fewer wrong pixels."""
+    reference = render(ball_room, "reference")
+    errors = {}
+    for kind in grid_kinds():
+        frame = render(ball_room, "reflector_map", refine="off", grid_share=0.1, grid_kind=kind, edge_px=0.0)
+        both = (frame["reflectedId"] > 0) & (reference["reflectedId"] == frame["reflectedId"])
+        distance = np.linalg.norm(frame.relative("reflectedPoint") - reference.relative("reflectedPoint"), axis=-1)
+        errors[kind] = np.median(distance[both])
+    assert errors["direction"] < errors["position"]
+
+
+def grid_kinds():
+    from warp_reflect.settings import GRID_KINDS
+
+    return GRID_KINDS
+
+
+def test_grid_holds_the_asked_share_and_every_vertex(ball_room):
+    cells = grid.build(ball_room, ball_room.parts[0], 0.1)
+    assert 0.04 < cells.share <= 0.1
+    local = cells.view.vertex_local.numpy()
+    assert (local >= 0).all() and (local <= 1).all()
+    cell = cells.view.vertex_cell.numpy()
+    nodes = cells.view.nodes.numpy()[cells.view.cell_nodes.numpy()]
+    inside = cell >= 0
+    low, high = nodes[cell[inside], 0], nodes[cell[inside], 7]
+    np.testing.assert_allclose(
+        low + local[inside] * (high - low), ball_room.host_points[inside], atol=1e-5 * ball_room.size
+    )
+
+
+def test_warm_start_gives_the_same_hits(ball_room):
+    cold = render(ball_room, "reflector_map")
+    warm = render(ball_room, "reflector_map", previous=cold)
+    assert identical(warm, cold) >= 0.9999
+
+
+def test_cutting_large_triangles_brings_their_picture_closer():
+    """A floor of two triangles: its checkerboard-free picture bends; cut, its points move to where they belong."""
+    scene = room(sphere(), placed(0, 0, -1), floor_cells=1)
+    reference = render(scene, "reference")
+    floor = reference["reflectedId"] == 2
+    medians = []
+    for edge_px in (0.0, 4.0, 0.25):
+        frame = render(scene, "reflector_map", refine="off", edge_px=edge_px)
+        both = floor & (frame["reflectedId"] == 2)
+        distance = np.linalg.norm(frame.relative("reflectedPoint") - reference.relative("reflectedPoint"), axis=-1)
+        medians.append(np.median(distance[both]) if both.sum() > 50 else np.inf)
+    assert medians[2] < 0.2 * medians[0] and medians[2] <= medians[1]
+
+
+def test_lattice_tiles_its_triangle():
+    weights, triangles = virtual_mesh._lattice(8)
+    assert len(triangles) == 64
+    corner = weights[triangles] * [0.0, 1.0, 1.0]
+    area = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    np.testing.assert_allclose(area[:, 0], 1 / 64)
+
+
+def test_statistics_count_every_mirror_pixel(ball_room):
+    frame = render(ball_room, "reflector_map")
+    settled = sum(frame.statistics.get(name, 0) for name in ("candidate", "walk", "empty", "bvh"))
+    assert settled == (frame["reflectorId"] > 0).sum()
+    assert set(np.unique(frame["status"])) <= {int(Status.NONE), int(Status.CONVERGED), int(Status.SKY)}
+
+
+def test_eye_inside_the_mirror_is_traced_without_faults(ball_room):
+    camera = dataclasses.replace(wr.make_plan(ball_room, size=(64, 36)).camera, eye=np.array([0, 0, -1.0]), near=1e-3)
+    frame = render(ball_room, "reflector_map", size=(64, 36), camera=camera)
+    assert (frame["reflectorId"] > 0).all()
+    assert all(np.isfinite(frame[name]).all() for name in frame.keys())
+
+
+def test_unknown_channel_lists_the_known(ball_room):
+    frame = render(ball_room, "reference", size=(32, 18))
+    with pytest.raises(KeyError, match="pathLength"):
+        frame["depth"]
+    assert frame["N.X"].shape == (18, 32) and frame["RGBA"].shape == (18, 32, 4)
