@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 
 from warp_reflect.bodies import analyse
-from warp_reflect.cubemap import FACE_COUNT, cube_point, face_axes, node_directions, project_to_cube
+from warp_reflect.cubemap import FACE_COUNT, cube_point, face_axes, node_directions
 from warp_reflect.launch import launch
 from warp_reflect.layers import CameraView
 from warp_reflect.raster import make_target, rasterise, resolve_kernel
@@ -94,14 +94,6 @@ def sample_map(map: ReflectorMapView, x: wp.vec3) -> MapSample:
     s.n_u = n_u - wp.dot(n_u, n) * n
     s.n_v = n_v - wp.dot(n_v, n) * n
     return s
-
-
-@wp.func
-def gauge(map: ReflectorMapView, q: wp.vec3) -> float:
-    """Minkowski gauge of the body at a unit-frame point: below 1 inside, above 1 outside (convex for a convex body)."""
-    w = wp.cw_mul(q, map.inv_extent)
-    s = sample_map(map, project_to_cube(w))
-    return wp.length(w) / wp.max(wp.length(wp.cw_mul(s.p, map.inv_extent)), 1.0e-20)
 
 
 @dataclass(frozen=True)

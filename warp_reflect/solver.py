@@ -19,11 +19,15 @@ import warp as wp
 
 from warp_reflect.launch import launch
 from warp_reflect.mirrors import PlanarMirror, QuadricMirror
+from warp_reflect.reflector_maps import ReflectorMap
+from warp_reflect.settings import Settings
 from warp_reflect.solve_convex import solve_convex_kernel
 from warp_reflect.solve_device import quadric_view
 from warp_reflect.solve_general import solve_general_kernel
+from warp_reflect.solve_map import solve_map_kernel
 from warp_reflect.solve_plane import solve_plane_kernel
 from warp_reflect.solve_qim import solve_qim_kernel
+from warp_reflect.techniques.reflector_map import search_settings
 
 MAX_PAIRS = 2**31 - 1  # elements of one launch: kernels index with 32-bit integers
 
@@ -339,4 +343,18 @@ def _(mirror: QuadricMirror, request: Request) -> Answer:
     inputs = [request.eyes, request.points, start, int(warm), view, *outputs]
     kernel = solve_convex_kernel if mirror.convex else solve_general_kernel
     launch(kernel, request.count, inputs, device, threads)
+    return answer
+
+
+@solve_on_device.register
+def _(mirror: ReflectorMap, request: Request) -> Answer:
+    if request.method != "newton" or request.all_roots:
+        raise ValueError("solve: a reflector map holds a convex body, which has one root; use method='newton' alone")
+    answer = Answer.empty(request, 1)
+    unit_from_world = wp.mat44d(mirror.unit_from_body)
+    world_from_unit = wp.mat44d(np.linalg.inv(mirror.unit_from_body))
+    chosen = search_settings(Settings(), mirror.resolution)
+    inputs = [request.eyes, request.points, mirror.view, unit_from_world, world_from_unit, chosen]
+    inputs += [answer.point, answer.normal, answer.virtual, answer.residual, answer.status]
+    launch(solve_map_kernel, request.count, inputs, request.points.device, request.threads)
     return answer
