@@ -7,7 +7,7 @@ Matrices act on columns: `p_world = world_from_object @ [p, 1]`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -111,7 +111,8 @@ class TextureRef:
 class MaterialData:
     """UsdPreviewSurface parameters; colours linear Rec.709.
 
-    A parameter with a texture holds what to use without it: its authored fallback, else the surface's default.
+    A parameter with a texture holds what to use without it: its authored fallback, else the surface's default; in
+    `Scene.data`, where it decides whether the surface is a mirror, the texture's mean.
     """
 
     path: str = ""
@@ -175,6 +176,9 @@ class SceneData:
     time_range: tuple[float, float] | None = None
     time_codes_per_second: float = 24.0
     collections: dict[str, tuple[str, ...]] = field(default_factory=dict)  # "/Prim.collection:name" to member paths
+    # Textures that were read with the stage, by `textures.picture_key`, float32 [h, w, 1 or 3]; None: read from files
+    # when they are needed.
+    pictures: dict[str, np.ndarray] | None = None
 
 
 # Shape kinds on the device.
@@ -211,6 +215,7 @@ class MaterialView:
     clearcoat: float
     clearcoat_f0: float
     uses_vertex_color: int
+    specular_workflow: int
 
 
 @wp.struct
@@ -250,7 +255,7 @@ class Scene:
     """A `SceneData` on a device.
 
     Attributes:
-        data: The host arrays it was made from.
+        data: The host arrays it was made from; textured parameters that make a mirror hold the textures' means.
         origin: float64 [3]; scene frame = world - origin.
         view: `SceneView` for kernels.
         parts: `PartRange` per (prim instance, subset), in triangle order.
@@ -263,6 +268,13 @@ class Scene:
         self.notes = list(data.notes)
         self._reload = reload
         self._bodies: dict[int, Body] = {}
+        self._pyramids: dict = {}
+        if any(material.textures for material in data.materials):
+            from warp_reflect import textures
+
+            materials, notes, self._pyramids = textures.mirror_constants(data)
+            self.data = data = replace(data, materials=materials)
+            self.notes += [note for note in notes if note not in self.notes]
         self.origin = _scene_origin(data)
         self._flatten()
 
@@ -337,6 +349,13 @@ class Scene:
         from warp_reflect import shade
 
         return shade.prepare_lights(self)
+
+    @cached_property
+    def textures(self):
+        """The textures as kernels look them up (`textures.TextureSet`), read at first use."""
+        from warp_reflect import textures
+
+        return textures.prepare_textures(self, self._pyramids)
 
     def body(self, part: int) -> Body:
         """The triangles of a part classified as a solid, scene frame."""
@@ -479,6 +498,7 @@ def material_view(material: MaterialData) -> MaterialView:
     view.clearcoat = material.clearcoat
     view.clearcoat_f0 = ((1.0 - material.ior) / (1.0 + material.ior)) ** 2
     view.uses_vertex_color = int(material.uses_vertex_color)
+    view.specular_workflow = int(material.specular_workflow)
     return view
 
 

@@ -16,11 +16,13 @@ def main() -> int:
     from warp_reflect.stage.layers import check_layers
     from warp_reflect.stage.read import read_stage
     from warp_reflect.stage.transfer import save
+    from warp_reflect.textures import with_pictures
 
     arguments["limits"] = Limits(**arguments["limits"])
     try:
         check_layers(arguments["path"], arguments["limits"])
-        save(read_stage(**arguments), folder)
+        # Pictures can be hostile as well: they are decoded here too.
+        save(with_pictures(read_stage(**arguments)), folder)
         answer = {}
     except (ValueError, FileNotFoundError) as fault:
         answer = {"error": str(fault), "kind": type(fault).__name__}

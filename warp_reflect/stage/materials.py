@@ -13,7 +13,8 @@ from warp_reflect.stage.intake import Intake, library_message
 from warp_reflect.stage.primvars import display_color, read_primvar
 from warp_reflect.stage.textures import is_texture, read_texture, scaled, value_of
 
-SHADED_TEXTURES: tuple[str, ...] = ()  # fields of MaterialData whose textures shade.py looks up
+# Fields of MaterialData whose textures shade.py looks up.
+SHADED_TEXTURES = ("base_color", "emissive", "specular_color", "metallic", "roughness", "clearcoat")
 NODE_HOPS_MAX = 16  # nodes followed from a surface input; longer chains (and cycles) are not evaluated
 PASS_THROUGH = ("ND_convert_", "ND_dot_", "ND_normalmap")
 EXTRACTED = ("r", "g", "b", "a")

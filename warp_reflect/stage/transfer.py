@@ -81,6 +81,11 @@ def check(data: SceneData) -> None:
         if light.texture is not None:
             good = good and light.texture.ndim == 3 and light.texture.shape[2] == 3
         _require(good and bool(np.isfinite(light.color).all()), f"light {light.path}")
+    textured = any(material.textures for material in data.materials)
+    _require(data.pictures is not None or not textured, "no pictures")  # this process is not to open them
+    for key, picture in (data.pictures or {}).items():
+        good = picture.dtype == np.float32 and picture.ndim == 3 and picture.shape[2] in (1, 3) and picture.size > 0
+        _require(good and bool(np.isfinite(picture).all()), f"picture {key}")
     for camera in data.cameras:
         numbers = [camera.horizontal_aperture, camera.vertical_aperture, camera.focal_length, camera.near, camera.far]
         good = camera.world_from_camera.shape == (4, 4) and bool(np.isfinite(camera.world_from_camera).all())
