@@ -26,7 +26,7 @@ from warp_reflect.layers import CameraView, GBuffer, ReflectionLayer, eye_ray_di
 from warp_reflect.scene import SHAPE_QUADRIC, LightData, Scene, SceneView
 from warp_reflect.shapes import clamp_weights, facet_normal, intersect_triangle, unit
 from warp_reflect.surface import shading_normal
-from warp_reflect.textures import TextureSet, footprint, sample, textured
+from warp_reflect.textures import Look, plain_look, prepare_looks
 
 wp.set_module_options({"enable_backward": False})
 
@@ -38,7 +38,6 @@ DEFAULT_SLOPE = 0.3
 SHARP_ROUGHNESS = wp.constant(0.05)
 ROUGH_ROUGHNESS = wp.constant(0.3)
 PI = wp.constant(float(np.pi))
-LEAST_LENGTH = wp.constant(1.0e-30)  # keeps the quotient of two lengths finite
 
 
 @wp.struct
@@ -245,88 +244,6 @@ def schlick(f0: wp.vec3, f90: wp.vec3, cosine: float) -> wp.vec3:
     return f0 + (m2 * m2 * m) * (f90 - f0)
 
 
-@wp.struct
-class Look:
-    """A material at one point."""
-
-    base_color: wp.vec3
-    f0: wp.vec3
-    f90: wp.vec3
-    emissive: wp.vec3
-    roughness: float
-    clearcoat: float
-    clearcoat_f0: float
-
-
-@wp.func
-def with_base(look: Look, color: wp.vec3, metallic: float) -> Look:
-    """The metallic workflow's F0 and F90 of another base colour and metallic; see `scene.reflectance`."""
-    dielectric = (1.0 - metallic) * look.clearcoat_f0
-    result = Look()
-    result.emissive = look.emissive
-    result.roughness = look.roughness
-    result.clearcoat = look.clearcoat
-    result.clearcoat_f0 = look.clearcoat_f0
-    result.base_color = color
-    result.f0 = wp.vec3(dielectric, dielectric, dielectric) + metallic * color
-    result.f90 = wp.vec3(1.0 - metallic, 1.0 - metallic, 1.0 - metallic) + metallic * color
-    return result
-
-
-@wp.func
-def look_at_point(
-    scene: SceneView,
-    textures: TextureSet,
-    triangle: int,
-    u: float,
-    v: float,
-    width: float,
-    cosine: float,
-) -> Look:
-    """A surface's material at a point, seen by a cone of the given width and cosine of incidence."""
-    material = scene.patches[scene.triangle_patch[triangle]].material
-    look = Look()
-    look.base_color = scene.materials[material].base_color
-    look.f0 = scene.materials[material].f0
-    look.f90 = scene.materials[material].f90
-    look.emissive = scene.materials[material].emissive
-    look.roughness = scene.materials[material].roughness
-    look.clearcoat = scene.materials[material].clearcoat
-    look.clearcoat_f0 = scene.materials[material].clearcoat_f0
-    metallic = scene.materials[material].metallic
-    if scene.materials[material].uses_vertex_color != 0 and scene.color_index.shape[0] > 0:
-        index = scene.color_index[triangle]
-        if index[0] >= 0:
-            color = (1.0 - u - v) * scene.colors[index[0]] + u * scene.colors[index[1]] + v * scene.colors[index[2]]
-            look.base_color = color
-            if metallic > 0.0:
-                look = with_base(look, color, metallic)
-    if textured(textures, triangle, material):
-        st = footprint(textures, scene, triangle, u, v, width, cosine)
-        binding = textures.bindings[material]
-        if binding.emissive >= 0:
-            look.emissive = sample(textures, binding.emissive, st)
-        if binding.roughness >= 0:
-            look.roughness = wp.min(sample(textures, binding.roughness, st)[0], 1.0)
-        if binding.clearcoat >= 0:
-            look.clearcoat = wp.min(sample(textures, binding.clearcoat, st)[0], 1.0)
-        color = look.base_color
-        if binding.base_color >= 0:
-            texel = sample(textures, binding.base_color, st)
-            # More than 1 would give back more light than it got.
-            color = wp.vec3(wp.min(texel[0], 1.0), wp.min(texel[1], 1.0), wp.min(texel[2], 1.0))
-        if scene.materials[material].specular_workflow != 0:
-            look.base_color = color
-            if binding.specular_color >= 0:
-                texel = sample(textures, binding.specular_color, st)
-                look.f0 = wp.vec3(wp.min(texel[0], 1.0), wp.min(texel[1], 1.0), wp.min(texel[2], 1.0))
-        elif binding.base_color >= 0 or binding.metallic >= 0:
-            if binding.metallic >= 0:
-                metallic = wp.min(sample(textures, binding.metallic, st)[0], 1.0)
-            look = with_base(look, color, metallic)
-    return look
-
-
 @wp.func
 def split_lobes(lights: LightView, look: Look, n: wp.vec3, cosine: float, reflector: bool) -> Lobes:
     """Base radiance and mirror weight of a surface.
@@ -374,34 +291,23 @@ def hit_normal(scene: SceneView, triangle: int, u: float, v: float) -> wp.vec3:
 
 
 @wp.func
-def weights_matter(scene: SceneView, textures: TextureSet, triangle: int) -> bool:
+def weights_matter(scene: SceneView, triangle: int) -> bool:
     """Whether shading looks different from point to point of a triangle."""
     if scene.normal_index[triangle][0] >= 0 or scene.color_index.shape[0] > 0:
         return True
-    patch = scene.triangle_patch[triangle]
-    if scene.patches[patch].shape == SHAPE_QUADRIC:
-        return True
-    return textured(textures, triangle, scene.patches[patch].material)
-
-
-@wp.func
-def pixel_width(camera: CameraView, depth: float) -> float:
-    """Width of a pixel's cone after a path of that depth along the camera's forward direction, in scene units."""
-    if camera.orthographic != 0:
-        return wp.length(camera.ray_dx)
-    return depth * wp.length(camera.ray_dx)
+    return scene.patches[scene.triangle_patch[triangle]].shape == SHAPE_QUADRIC
 
 
 @wp.func
 def hit_radiance(
     scene: SceneView,
-    textures: TextureSet,
     lights: LightView,
+    looks: wp.array(dtype=Look),
+    i: int,
     triangle: int,
     u: float,
     v: float,
     direction: wp.vec3,
-    width: float,
 ) -> wp.vec3:
     """Radiance back along a unit ray: of the surface it hits, which mirrors only the dome, or of the dome."""
     base = wp.vec3(0.0, 0.0, 0.0)
@@ -413,7 +319,11 @@ def hit_radiance(
         onward = direction - 2.0 * cosine * n
         if cosine > 0.0:
             n = -n
-        look = look_at_point(scene, textures, triangle, u, v, width, wp.abs(cosine))
+        look = Look()
+        if looks.shape[0] > 0:
+            look = looks[i]
+        else:
+            look = plain_look(scene, triangle, u, v)
         lobes = split_lobes(lights, look, n, wp.abs(cosine), False)
         base = lobes.base
         weight = lobes.mirror
@@ -427,8 +337,8 @@ def shade_kernel(
     first: int,
     scene: SceneView,
     camera: CameraView,
-    textures: TextureSet,
     lights: LightView,
+    looks: wp.array(dtype=Look),
     triangle: wp.array(dtype=int),
     reflector_id: wp.array(dtype=int),
     # Outputs:
@@ -450,8 +360,7 @@ def shade_kernel(
     coverage = float(0.0)
     if tri >= 0:
         uv = wp.vec2(0.0, 0.0)
-        depth = float(0.0)
-        if weights_matter(scene, textures, tri):
+        if weights_matter(scene, tri):
             corner = scene.triangles[tri]
             hit = intersect_triangle(
                 eye_ray_origin(camera, x, y),
@@ -461,13 +370,16 @@ def shade_kernel(
                 scene.points[corner[2]] - camera.eye,
             )
             uv = clamp_weights(hit.u, hit.v)
-            depth = wp.max(hit.t, 0.0)
         n = hit_normal(scene, tri, uv[0], uv[1])
         cosine = wp.dot(n, incident)
         onward = incident - 2.0 * cosine * n
         if cosine > 0.0:
             n = -n
-        look = look_at_point(scene, textures, tri, uv[0], uv[1], pixel_width(camera, depth), wp.abs(cosine))
+        look = Look()
+        if looks.shape[0] > 0:
+            look = looks[i]
+        else:
+            look = plain_look(scene, tri, uv[0], uv[1])
         lobes = split_lobes(lights, look, n, wp.abs(cosine), reflector)
         base = lobes.base
         weight = lobes.mirror
@@ -485,13 +397,10 @@ def shade_kernel(
 def mirror_term_kernel(
     first: int,
     scene: SceneView,
-    camera: CameraView,
-    textures: TextureSet,
     lights: LightView,
+    looks: wp.array(dtype=Look),
     pixel: wp.array(dtype=int),
-    point: wp.array(dtype=wp.vec3),
     direction: wp.array(dtype=wp.vec3),
-    distance: wp.array(dtype=float),
     triangle: wp.array(dtype=int),
     u: wp.array(dtype=float),
     v: wp.array(dtype=float),
@@ -502,11 +411,7 @@ def mirror_term_kernel(
     """One thread per mirror pixel; finds the mirror's weight in `out_mirror`."""
     i = first + wp.tid()
     p = pixel[i]
-    # The cone goes on behind the mirror as it came; that a curved one widens it is left out.
-    to_mirror = point[i] - camera.eye
-    longer = 1.0 + distance[i] / wp.max(wp.length(to_mirror), LEAST_LENGTH)
-    width = pixel_width(camera, wp.dot(camera.forward, to_mirror) * longer)
-    seen = hit_radiance(scene, textures, lights, triangle[i], u[i], v[i], direction[i], width)
+    seen = hit_radiance(scene, lights, looks, i, triangle[i], u[i], v[i], direction[i])
     term = wp.cw_mul(out_mirror[p], seen)
     out_mirror[p] = term
     out_picture[p] += wp.vec4(term[0], term[1], term[2], 0.0)
@@ -532,22 +437,12 @@ def shade(
     lights = scene.lights
     picture = wp.empty(count, dtype=wp.vec4, device=device)
     mirror = wp.empty(count, dtype=wp.vec3, device=device)
-    textures = scene.textures
-    inputs = [scene.view, gbuffer.view, textures, lights, gbuffer.triangle, gbuffer.reflector_id, picture, mirror]
+    looks = prepare_looks(scene, gbuffer, None, threads)
+    inputs = [scene.view, gbuffer.view, lights, looks, gbuffer.triangle, gbuffer.reflector_id, picture, mirror]
     launch.launch(shade_kernel, count, inputs, device, threads)
     for layer in layers.values():
         pixels = layer.pixels
-        inputs = [scene.view, gbuffer.view, textures, lights]
-        inputs += [
-            pixels.pixel,
-            pixels.point,
-            pixels.direction,
-            layer.distance,
-            layer.triangle,
-            layer.u,
-            layer.v,
-            picture,
-            mirror,
-        ]
+        inputs = [scene.view, lights, prepare_looks(scene, gbuffer, layer, threads), pixels.pixel, pixels.direction]
+        inputs += [layer.triangle, layer.u, layer.v, picture, mirror]
         launch.launch(mirror_term_kernel, pixels.count, inputs, device, threads)
     return picture, mirror

@@ -19,8 +19,11 @@ from weakref import WeakValueDictionary
 import numpy as np
 import warp as wp
 
+from warp_reflect import launch
 from warp_reflect.images import Picture, read_image
+from warp_reflect.layers import CameraView, GBuffer, ReflectionLayer, eye_ray_direction, eye_ray_origin
 from warp_reflect.scene import MaterialData, Note, Scene, SceneData, SceneView, TextureRef
+from warp_reflect.shapes import clamp_weights, facet_normal, intersect_triangle, unit
 
 wp.set_module_options({"enable_backward": False})
 
@@ -42,6 +45,7 @@ WRAPS = {"useMetadata": 0, "repeat": 0, "clamp": 1, "mirror": 2, "black": 3}
 
 # At a grazing angle the cone's footprint is a line; a box filter that covered its length would blur it across.
 LEAST_COSINE = wp.constant(0.1)
+LEAST_LENGTH = wp.constant(1.0e-30)  # keeps the quotient of two lengths finite
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -520,16 +524,8 @@ def sample(textures: TextureSet, number: int, st: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def textured(textures: TextureSet, triangle: int, material: int) -> bool:
-    """Whether any parameter of a triangle's material is looked up."""
-    if textures.textures.shape[0] == 0:
-        return False
-    return textures.bindings[material].count > 0 and textures.uv_index[triangle][0] >= 0
-
-
-@wp.func
 def footprint(
-    textures: TextureSet, scene: SceneView, triangle: int, u: float, v: float, width: float, cosine: float
+    textures: TextureSet, scene: SceneView, triangle: int, u: float, v: float, direction: wp.vec3, width: float
 ) -> wp.vec3:
     """Texture coordinates at a hit, and how much of them the pixel's cone covers.
 
@@ -539,8 +535,8 @@ def footprint(
         triangle: The triangle hit.
         u: Weight of its second corner.
         v: Weight of its third corner.
-        width: Of the cone at the hit, across the ray. [scene units]
-        cosine: Of the angle of incidence, positive.
+        direction: Of the cone, unit.
+        width: Of the cone at the hit, across it. [scene units]
 
     Source: Akenine-Moller et al., Texture Level of Detail Strategies for Real-Time Ray Tracing, Ray Tracing Gems
     2019, chapter 20, equations 20-4 and 20-6 (ray cones). Differs from it by `LEAST_COSINE`.
@@ -551,10 +547,195 @@ def footprint(
     c = textures.uvs[index[2]]
     st = (1.0 - u - v) * a + u * b + v * c
     tri = scene.triangles[triangle]
-    corner = scene.points[tri[0]]
-    area = wp.length(wp.cross(scene.points[tri[1]] - corner, scene.points[tri[2]] - corner))
+    p0 = scene.points[tri[0]]
+    p1 = scene.points[tri[1]]
+    p2 = scene.points[tri[2]]
+    area = wp.length(wp.cross(p1 - p0, p2 - p0))
+    cosine = wp.abs(wp.dot(facet_normal(p0, p1, p2), direction))
     picture_area = wp.abs((b[0] - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (b[1] - a[1]))
     covered = float(0.0)
     if area > 0.0:
         covered = width / wp.max(cosine, LEAST_COSINE) * wp.sqrt(picture_area / area)
     return wp.vec3(st[0], st[1], covered)
+
+
+@wp.struct
+class Look:
+    """A material at one point."""
+
+    base_color: wp.vec3
+    f0: wp.vec3
+    f90: wp.vec3
+    emissive: wp.vec3
+    roughness: float
+    clearcoat: float
+    clearcoat_f0: float
+
+
+@wp.func
+def with_base(look: Look, color: wp.vec3, metallic: float) -> Look:
+    """The metallic workflow's F0 and F90 of another base colour and metallic; see `scene.reflectance`."""
+    dielectric = (1.0 - metallic) * look.clearcoat_f0
+    result = Look()
+    result.emissive = look.emissive
+    result.roughness = look.roughness
+    result.clearcoat = look.clearcoat
+    result.clearcoat_f0 = look.clearcoat_f0
+    result.base_color = color
+    result.f0 = wp.vec3(dielectric, dielectric, dielectric) + metallic * color
+    result.f90 = wp.vec3(1.0 - metallic, 1.0 - metallic, 1.0 - metallic) + metallic * color
+    return result
+
+
+@wp.func
+def plain_look(scene: SceneView, triangle: int, u: float, v: float) -> Look:
+    """A surface's material from its constants and the colours of its corners."""
+    material = scene.patches[scene.triangle_patch[triangle]].material
+    look = Look()
+    look.base_color = scene.materials[material].base_color
+    look.f0 = scene.materials[material].f0
+    look.f90 = scene.materials[material].f90
+    look.emissive = scene.materials[material].emissive
+    look.roughness = scene.materials[material].roughness
+    look.clearcoat = scene.materials[material].clearcoat
+    look.clearcoat_f0 = scene.materials[material].clearcoat_f0
+    if scene.materials[material].uses_vertex_color != 0 and scene.color_index.shape[0] > 0:
+        index = scene.color_index[triangle]
+        if index[0] >= 0:
+            color = (1.0 - u - v) * scene.colors[index[0]] + u * scene.colors[index[1]] + v * scene.colors[index[2]]
+            look.base_color = color
+            if scene.materials[material].metallic > 0.0:
+                look = with_base(look, color, scene.materials[material].metallic)
+    return look
+
+
+@wp.func
+def look_at_point(
+    scene: SceneView, textures: TextureSet, triangle: int, u: float, v: float, direction: wp.vec3, width: float
+) -> Look:
+    """A surface's material at a point that a cone of the given unit direction and width meets."""
+    look = plain_look(scene, triangle, u, v)
+    material = scene.patches[scene.triangle_patch[triangle]].material
+    binding = textures.bindings[material]
+    if binding.count == 0 or textures.uv_index[triangle][0] < 0:
+        return look
+    st = footprint(textures, scene, triangle, u, v, direction, width)
+    if binding.emissive >= 0:
+        look.emissive = sample(textures, binding.emissive, st)
+    if binding.roughness >= 0:
+        look.roughness = wp.min(sample(textures, binding.roughness, st)[0], 1.0)
+    if binding.clearcoat >= 0:
+        look.clearcoat = wp.min(sample(textures, binding.clearcoat, st)[0], 1.0)
+    color = look.base_color
+    if binding.base_color >= 0:
+        color = below_one(sample(textures, binding.base_color, st))
+    if scene.materials[material].specular_workflow != 0:
+        look.base_color = color
+        if binding.specular_color >= 0:
+            look.f0 = below_one(sample(textures, binding.specular_color, st))
+    elif binding.base_color >= 0 or binding.metallic >= 0:
+        metallic = scene.materials[material].metallic
+        if binding.metallic >= 0:
+            metallic = wp.min(sample(textures, binding.metallic, st)[0], 1.0)
+        look = with_base(look, color, metallic)
+    return look
+
+
+@wp.func
+def below_one(color: wp.vec3) -> wp.vec3:
+    """A reflectance: above 1 a surface would give back more light than it gets."""
+    return wp.vec3(wp.min(color[0], 1.0), wp.min(color[1], 1.0), wp.min(color[2], 1.0))
+
+
+@wp.func
+def pixel_width(camera: CameraView, depth: float) -> float:
+    """Width of a pixel's cone after a path of that depth along the camera's forward direction, in scene units."""
+    if camera.orthographic != 0:
+        return wp.length(camera.ray_dx)
+    return depth * wp.length(camera.ray_dx)
+
+
+@wp.kernel
+def eye_looks_kernel(
+    first: int,
+    scene: SceneView,
+    camera: CameraView,
+    textures: TextureSet,
+    triangle: wp.array(dtype=int),
+    out_looks: wp.array(dtype=Look),
+):
+    """One thread per pixel."""
+    i = first + wp.tid()
+    tri = triangle[i]
+    if tri < 0:
+        return
+    row = i // camera.width
+    x = float(i - row * camera.width) + 0.5
+    y = float(row) + 0.5
+    ray = eye_ray_direction(camera, x, y)
+    corner = scene.triangles[tri]
+    hit = intersect_triangle(
+        eye_ray_origin(camera, x, y),
+        ray,
+        scene.points[corner[0]] - camera.eye,
+        scene.points[corner[1]] - camera.eye,
+        scene.points[corner[2]] - camera.eye,
+    )
+    uv = clamp_weights(hit.u, hit.v)
+    width = pixel_width(camera, wp.max(hit.t, 0.0))
+    out_looks[i] = look_at_point(scene, textures, tri, uv[0], uv[1], unit(ray), width)
+
+
+@wp.kernel
+def mirrored_looks_kernel(
+    first: int,
+    scene: SceneView,
+    camera: CameraView,
+    textures: TextureSet,
+    point: wp.array(dtype=wp.vec3),
+    direction: wp.array(dtype=wp.vec3),
+    distance: wp.array(dtype=float),
+    triangle: wp.array(dtype=int),
+    u: wp.array(dtype=float),
+    v: wp.array(dtype=float),
+    out_looks: wp.array(dtype=Look),
+):
+    """One thread per mirror pixel. The cone goes on behind a mirror as it came: that a curved one widens it is left out."""
+    i = first + wp.tid()
+    if triangle[i] < 0:
+        return
+    to_mirror = point[i] - camera.eye
+    longer = 1.0 + distance[i] / wp.max(wp.length(to_mirror), LEAST_LENGTH)
+    width = pixel_width(camera, wp.dot(camera.forward, to_mirror) * longer)
+    out_looks[i] = look_at_point(scene, textures, triangle[i], u[i], v[i], direction[i], width)
+
+
+def prepare_looks(scene: Scene, gbuffer: GBuffer, layer: ReflectionLayer | None, threads: int = 0) -> wp.array:
+    """The materials that a frame shows, where any of the scene is textured.
+
+    Kernels of their own, so that a scene without textures is shaded by small ones.
+
+    Args:
+        scene: On the G-buffer's device.
+        gbuffer: What the eye sees.
+        layer: What is seen in a mirror; None: of what the eye sees itself.
+        threads: CPU threads; 0: one per core.
+
+    Returns:
+        `Look` [pixels of the G-buffer or of the layer], not set where nothing is seen; length 0 where nothing of the
+        scene is textured.
+    """
+    textures = scene.textures
+    if textures.textures.shape[0] == 0:
+        return wp.zeros(0, dtype=Look, device=scene.device)
+    if layer is None:
+        looks = wp.zeros(len(gbuffer.triangle), dtype=Look, device=scene.device)
+        inputs = [scene.view, gbuffer.view, textures, gbuffer.triangle, looks]
+        launch.launch(eye_looks_kernel, len(looks), inputs, scene.device, threads)
+        return looks
+    pixels = layer.pixels
+    looks = wp.zeros(pixels.count, dtype=Look, device=scene.device)
+    inputs = [scene.view, gbuffer.view, textures, pixels.point, pixels.direction, layer.distance]
+    inputs += [layer.triangle, layer.u, layer.v, looks]
+    launch.launch(mirrored_looks_kernel, pixels.count, inputs, scene.device, threads)
+    return looks
