@@ -187,7 +187,8 @@ def test_job_that_fails_part_way_keeps_and_names_what_is_finished(stage, call):
         (["render", "stage.usda", "a.exr", "--reflector", "/World/None*"], "/World/None*"),
         (["render", "stage.usda", "a.exr", "--purposes", "everything"], "proxy"),
         (["render", "stage.usda", "a.exr", "--complexity", "extreme"], "veryhigh"),
-        (["render", "stage.usda", "a.exr", "--untrusted"], "--untrusted"),
+        (["render", "stage.usda", "a.exr", "--root", "elsewhere"], "outside the folder elsewhere"),
+        (["render", "stage.usda", "a.exr", "--root", "elsewhere", "--untrusted"], "outside the folder elsewhere"),
         (["render", "stage.usda", "a.exr", "--bogus"], "--bogus"),
         (["plan", "stage.usda", "more.usda"], "more.usda"),
         (["compare", "none.exr", "stage.usda"], "none.exr: cannot be read: no such file"),
@@ -254,6 +255,51 @@ def test_plan_is_text_or_json(stage, call):
     assert [(row["path"], row["technique"], row["forced"]) for row in numbers["reflectors"]] == [
         ("/World/Mirror", "raytraced", True)
     ]
+
+
+def test_chosen_reflectors_join_the_mirrors_of_the_stage(stage, call):
+    def mirrors(*tokens: str) -> list[str]:
+        code, out, _ = call("plan", stage, "--json", *tokens)
+        assert code == 0
+        return [row["path"] for row in json.loads(out)["reflectors"]]
+
+    assert mirrors() == ["/World/Mirror"]
+    # The box has no material: the word of the user alone makes it a mirror.
+    assert mirrors("--reflector", "/World/Box") == ["/World/Mirror", "/World/Box"]
+    assert mirrors("--reflector", "Bo?", "--reflector", "/World/Mirror") == ["/World/Mirror", "/World/Box"]
+    assert call("render", stage, "a.exr", "--reflector", "Box", "-w", "80")[0] == 0
+    assert {1, 2} <= set(np.unique(images.read_exr("a.exr")[0]["reflectorId"]))
+
+
+def test_untrusted_stage_gives_the_same_frame(stage, call):
+    for name, options in {"a.exr": [], "b.exr": ["--untrusted", "--root", "."]}.items():
+        assert call("render", stage, name, "-w", "40", *options)[0] == 0
+    (plain, _), (guarded, _) = images.read_exr("a.exr"), images.read_exr("b.exr")
+    for name in plain:
+        np.testing.assert_array_equal(plain[name], guarded[name], err_msg=name)
+
+
+def test_untrusted_stage_reads_nothing_outside_its_folder(stage, call):
+    Path("inner").mkdir()
+    Path("inner/stage.usda").write_text(
+        '#usda 1.0\n(\n    defaultPrim = "World"\n    subLayers = [@../stage.usda@]\n)\n'
+    )
+    assert call("plan", "inner/stage.usda")[0] == 0
+    code, out, err = call("plan", "inner/stage.usda", "--untrusted")
+    assert (code, out, len(err.splitlines())) == (2, "", 1)
+    assert "outside the folder" in err
+    assert call("plan", "inner/stage.usda", "--untrusted", "--root", ".")[0] == 0
+
+
+def test_stage_without_camera_is_framed(stage, call):
+    Path("bare.usda").write_text(STAGE.replace('def Camera "Camera"', 'def Xform "Camera"'))
+    code, out, err = call("render", "bare.usda", "a.exr", "-w", "90")
+    assert code == 0
+    assert "the stage has no camera; one that frames it is used" in err
+    seen = images.read_exr("a.exr")[0]["primId"]
+    assert set(np.unique(seen)) == {0, 1, 2}
+    border = np.concatenate([seen[0], seen[-1], seen[:, 0], seen[:, -1]])
+    assert not border.any()
 
 
 def test_compare_measures_a_technique_against_the_reference(stage, call):

@@ -48,9 +48,9 @@ class StageOptions:
     strict: Annotated[bool, Parameter(negative=())] = False
     """Refuse a stage with a prim that cannot be used, instead of dropping the prim with a note."""
     untrusted: Annotated[bool, Parameter(negative=())] = False
-    """Open the stage in a child process, and read nothing outside --root."""
+    """Read the stage in a child process with bounded time and memory, and nothing outside --root."""
     root: str | None = None
-    """The folder an untrusted stage may read from (default: the stage's own)."""
+    """The folder that layers and pictures must lie in (default: anywhere; with --untrusted the stage's own)."""
     debug: Annotated[bool, Parameter(negative=())] = False
     """Show tracebacks."""
 
@@ -69,7 +69,7 @@ class PlanOptions:
     method: str = "auto"
     """auto, reference (every mirror ray traced) or a technique."""
     reflector: Annotated[list[str] | None, Parameter(negative=())] = None
-    """Treat the prims that match this path or pattern (* and ?) as mirrors; repeatable."""
+    """Make mirrors of the prims, materials or collection that this path, name or pattern (* and ?) names; repeatable."""
     set_: Annotated[list[str] | None, Parameter(name="--set", negative=())] = None
     """A setting, name=value; repeatable."""
     complexity: Annotated[str | None, Parameter(name=["--complexity", "-c"])] = None
@@ -100,7 +100,7 @@ def plan(
     device = _open_device(opened.device)
     with _progress() as show:
         show("reading " + stage)
-        scene = _load(stage, opened, settings, device, None)
+        scene = _load(stage, opened, planned, settings, device, None)
         show("planning")
         made = _make_plan(scene, planned, settings)
     if json_:
@@ -164,7 +164,7 @@ def render(
     with _progress(len(times)) as show:
         try:
             show("reading " + stage)
-            first = _load(stage, opened, settings, device, times[0])
+            first = _load(stage, opened, planned, settings, device, times[0])
             made, previous = None, None
             for time, row in zip(times, files, strict=True):
                 label = stage if time is None else f"frame {time:g}"
@@ -358,12 +358,9 @@ def _purposes(text: str) -> tuple[str, ...]:
 # Scenes.
 
 
-def _load(stage: str, opened: StageOptions, settings, device: str, time: float | None):
+def _load(stage: str, opened: StageOptions, planned: PlanOptions, settings, device: str, time: float | None):
     import warp_reflect as wr
 
-    if opened.untrusted or opened.root is not None:
-        # Reading it here all the same would take the protection for granted.
-        raise NotImplementedError("--untrusted, --root: stages are read in this process only so far")
     return wr.load_stage(
         stage,
         device=device,
@@ -371,6 +368,9 @@ def _load(stage: str, opened: StageOptions, settings, device: str, time: float |
         purposes=_purposes(opened.purposes),
         complexity=settings.complexity,
         strict=opened.strict,
+        reflectors=tuple(planned.reflector or ()),
+        untrusted=opened.untrusted,
+        root=opened.root or "",
     )
 
 
@@ -391,7 +391,6 @@ def _make_plan(scene, planned: PlanOptions, settings):
         size=size,
         settings=settings,
         method=planned.method,
-        reflectors=tuple(planned.reflector or ()),
     )
 
 

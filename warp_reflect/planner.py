@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import fnmatch
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -129,7 +128,6 @@ def make_plan(
     size: tuple[int, int] = DEFAULT_SIZE,
     settings: Settings | None = None,
     method: str = "auto",
-    reflectors: tuple[str, ...] = (),
 ) -> Plan:
     """Decide what is simulated for every reflector of a scene.
 
@@ -140,10 +138,9 @@ def make_plan(
         settings: The knobs; None: the defaults.
         method: `auto`, `reference` (every mirror traced) or a key of `TECHNIQUES`; where it does not apply the mirror
             is traced, with a note.
-        reflectors: Glob patterns of prim paths that alone reflect; empty: what the materials say.
 
     Raises:
-        ValueError: an unknown method, an impossible size, no such camera, or a pattern that matches no drawn prim.
+        ValueError: an unknown method, an impossible size, or no such camera.
     """
     settings = settings or Settings()
     if method not in METHODS and method not in TECHNIQUES:
@@ -154,8 +151,6 @@ def make_plan(
     found = [
         (k, part, weight) for k, part in enumerate(scene.parts) if (weight := mirror_weight(scene, part, settings))
     ]
-    if reflectors:
-        found = _chosen(scene, reflectors)
     pixels = _pixel_counts(scene, view, [k for k, _, _ in found], settings)
     rows = [
         _row(scene, view, settings, method, number, part_index, part, weight, pixels[part_index], notes)
@@ -195,22 +190,6 @@ def mirror_weight(scene: Scene, part: PartRange, settings: Settings) -> float:
     if material.roughness <= settings.reflector_max_roughness and weight >= settings.reflector_min_weight:
         return weight
     return 0.0
-
-
-def _chosen(scene: Scene, patterns: tuple[str, ...]) -> list[tuple[int, PartRange, float]]:
-    found = []
-    for pattern in patterns:
-        matching = [
-            (k, part, 1.0)
-            for k, part in enumerate(scene.parts)
-            if fnmatch.fnmatchcase(part.prim_path, pattern) or part.prim_path.startswith(pattern.rstrip("/") + "/")
-        ]
-        if not matching:
-            raise ValueError(
-                f"reflector: '{pattern}' matches no drawn prim; give a prim path or a glob such as '/World/*'"
-            )
-        found += [row for row in matching if row[0] not in {k for k, _, _ in found}]
-    return sorted(found, key=lambda row: row[0])
 
 
 PREVIEW_SIDE = 320  # pixels; enough to count a mirror's pixels within a few per cent for the choice of technique

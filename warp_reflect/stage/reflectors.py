@@ -6,10 +6,14 @@ import dataclasses
 import difflib
 from fnmatch import fnmatchcase
 
+import numpy as np
+
 from warp_reflect.scene import MaterialData, SceneData, reflectance
 from warp_reflect.settings import Settings
 
 OVERRIDDEN = ("metallic", "roughness")
+CHROME = (0.55, 0.556, 0.554)  # normal reflectance of polished chromium, linear Rec. 709
+REC709_LUMINANCE = (0.2126, 0.7152, 0.0722)
 
 
 def override_reflectors(
@@ -90,10 +94,23 @@ def _below(path: str, name: str) -> bool:
 
 
 def mirrored(material: MaterialData, metallic: float, roughness: float) -> MaterialData:
-    """The material with another metallic and roughness, constant, in the metallic workflow."""
-    textures = {name: ref for name, ref in material.textures.items() if name not in OVERRIDDEN}
+    """The material with another metallic and roughness, constant, in the metallic workflow.
+
+    A metal reflects with its base colour. Where that is too dark to count as a mirror's, or is only the
+    fallback of what has no material, the mirror is chrome: who names a mirror wants to see one.
+    """
+    dropped, base = set(OVERRIDDEN), material.base_color
+    unnamed = not material.path and not material.uses_vertex_color
+    if unnamed or float(np.dot(base, REC709_LUMINANCE)) < Settings().reflector_min_weight:
+        base = CHROME
+        dropped.add("base_color")
     return dataclasses.replace(
-        material, metallic=metallic, roughness=roughness, specular_workflow=False, textures=textures
+        material,
+        base_color=base,
+        metallic=metallic,
+        roughness=roughness,
+        specular_workflow=False,
+        textures={name: ref for name, ref in material.textures.items() if name not in dropped},
     )
 
 
