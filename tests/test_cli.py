@@ -293,7 +293,7 @@ def test_untrusted_stage_reads_nothing_outside_its_folder(stage, call):
 
 def test_stage_without_camera_is_framed(stage, call):
     Path("bare.usda").write_text(STAGE.replace('def Camera "Camera"', 'def Xform "Camera"'))
-    code, out, err = call("render", "bare.usda", "a.exr", "-w", "90")
+    code, _, err = call("render", "bare.usda", "a.exr", "-w", "90")
     assert code == 0
     assert "the stage has no camera; one that frames it is used" in err
     seen = images.read_exr("a.exr")[0]["primId"]
@@ -389,6 +389,14 @@ def test_cut_cached_kernels_are_found(cached_module, suffix, share, device):
     os.truncate(file, int(share * file.stat().st_size))
     assert cli.heal_kernel_cache(cached_module.parent) == [cached_module]
     assert not cached_module.exists()
+
+
+def test_kernels_that_another_process_compiles_are_left_alone(cached_module):
+    building = cached_module.rename(f"{cached_module}_p123_t140415733521280")
+    for file in building.iterdir():
+        os.truncate(file, 0)
+    assert cli.heal_kernel_cache(building.parent) == []
+    assert building.is_dir()
 
 
 LOAD = """

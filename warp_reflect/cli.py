@@ -9,6 +9,7 @@ from __future__ import annotations
 import atexit
 import json
 import os
+import re
 import shutil
 import sys
 import tempfile
@@ -29,6 +30,9 @@ from warp_reflect import images
 DONE, PART_WAY, IMPOSSIBLE = 0, 1, 2
 NOTES_SHOWN = 40  # a stage of thousands of prims may have thousands; `plan --json` has them all
 SIDE_MAX = 32768  # pixels; what the image readers of this package accept back
+
+# Warp compiles into such a folder (process, thread) and renames it when it is whole; another process may be at it.
+BEING_WRITTEN = re.compile(r"_p\d+_t\d+$")
 
 # What a user's input can cause; anything else is a fault of this program.
 REFUSALS = (ValueError, KeyError, OSError, NotImplementedError, MemoryError)
@@ -506,7 +510,11 @@ def heal_kernel_cache(cache: Path) -> list[Path]:
     Returns:
         The folders deleted.
     """
-    damaged = [folder for folder in cache.glob("wp_warp_reflect*") if folder.is_dir() and not _is_whole(folder)]
+    damaged = [
+        folder
+        for folder in cache.glob("wp_warp_reflect*")
+        if folder.is_dir() and not BEING_WRITTEN.search(folder.name) and not _is_whole(folder)
+    ]
     for folder in damaged:
         shutil.rmtree(folder, ignore_errors=True)
     return damaged
