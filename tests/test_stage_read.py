@@ -397,6 +397,17 @@ def test_impossible_camera_is_named_and_dropped(stage, attribute, value):
         read(stage, strict=True)
 
 
+@pytest.mark.parametrize(("last", "cameras"), [(1.0 + 2.0**-52, ["/Eye"]), (1.01, ["/__default camera"])])
+def test_rounded_last_entry_of_a_matrix_is_no_projection(stage, last, cameras):
+    samples.add_cube_mesh(stage, "/Cube")
+    matrix = Gf.Matrix4d(1.0).SetTranslate(Gf.Vec3d(0, 0, 5))
+    matrix[3, 3] = last
+    UsdGeom.Camera.Define(stage, "/Eye").AddTransformOp().Set(matrix)
+    data = read(stage)
+    assert [camera.path for camera in data.cameras] == cameras
+    np.testing.assert_array_equal(data.cameras[0].world_from_camera[3], [0, 0, 0, 1])
+
+
 @pytest.mark.parametrize("up_axis", ["Y", "Z"])
 def test_default_camera_sees_everything(tmp_path, up_axis):
     stage = samples.new_stage(tmp_path / "s.usda", up_axis)

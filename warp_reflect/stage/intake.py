@@ -20,6 +20,8 @@ from warp_reflect.stage.guard import Limits
 COORDINATE_MAX = 1.0e12
 # det / scale^3 below which a transform flattens what it places and has no usable inverse.
 SINGULAR_VOLUME = 1.0e-12
+AFFINE_ROW = (0.0, 0.0, 0.0, 1.0)
+AFFINE_ROUNDING = 1.0e-12  # of the projective row: thousands of float64 units, far below any projection
 
 
 class BadPrim(ValueError):
@@ -132,15 +134,21 @@ def library_message(fault: Tf.ErrorException) -> str:
 
 
 def column_matrix(matrix) -> np.ndarray:
-    """A Gf.Matrix4d (rows, acts on row vectors) as float64 [4, 4] acting on columns."""
-    return np.array(matrix, np.float64).T
+    """A Gf.Matrix4d (rows, acts on row vectors) as float64 [4, 4] acting on columns.
+
+    A projective row that is 0, 0, 0, 1 but for rounding, as the inverse of a matrix leaves it, becomes that.
+    """
+    columns = np.array(matrix, np.float64).T.copy()
+    if np.abs(columns[3] - AFFINE_ROW).max() <= AFFINE_ROUNDING:
+        columns[3] = AFFINE_ROW
+    return columns
 
 
 def transform_fault(world_from_object: np.ndarray) -> str:
     """What makes a transform unusable, as text for a note; empty if nothing does."""
     if not np.isfinite(world_from_object).all():
         return "transform: got a value that is not finite, expected finite numbers"
-    if not np.array_equal(world_from_object[3], [0.0, 0.0, 0.0, 1.0]):
+    if not np.array_equal(world_from_object[3], AFFINE_ROW):
         return f"transform: got the projective row {world_from_object[3].tolist()}, expected 0, 0, 0, 1"
     if np.abs(world_from_object).max() > COORDINATE_MAX:
         return f"transform: got {np.abs(world_from_object).max():g}, expected at most {COORDINATE_MAX:g}"
