@@ -381,8 +381,159 @@ def test_shade_is_equal_for_any_number_of_threads():
 
 
 def test_prepared_lights_ignore_kinds_they_do_not_know():
-    strange = LightData("/lamp", "rect", (9.0, 9.0, 9.0), np.eye(4))
+    strange = LightData("/lamp", "portal", (9.0, 9.0, 9.0), np.eye(4))
     scene = scene_of([], [strange, dome((0.25, 0.5, 0.75))])
     rgba = picture_of(scene, look_at((0, 0, 0), (0, 0, 1), size=(4, 4)))[0]
     np.testing.assert_allclose(rgba[:, :3], np.tile(np.float32([0.25, 0.5, 0.75]), (16, 1)))
     assert isinstance(scene.lights.texels, wp.array)
+
+
+WHITE = MaterialData(base_color=(1, 1, 1), roughness=1.0, ior=1.0)  # shows its irradiance / pi
+
+
+def ground(half=9.0) -> MeshData:
+    """In the plane y = 0, facing up."""
+    return MeshData(
+        points=np.float32([[-half, 0, -half], [half, 0, -half], [half, 0, half], [-half, 0, half]]),
+        triangles=np.int32([[0, 2, 1], [0, 3, 2]]),
+    )
+
+
+def emitting_elements(kind, size, world, count=160):
+    """(points [n, 3], normals [n, 3], areas [n]) of a shape light's surface."""
+    a, b = (grid.reshape(-1) for grid in np.meshgrid(*[(np.arange(count) + 0.5) / count] * 2, indexing="ij"))
+    zero = np.zeros_like(a)
+    if kind == "rect":
+        p = np.stack([(a - 0.5) * size[0], (b - 0.5) * size[1], zero], axis=1)
+        n, area = np.tile([0.0, 0, -1], (len(a), 1)), np.full(len(a), size[0] * size[1])
+    elif kind == "disk":
+        r, t = size[0] * np.sqrt(a), 2 * np.pi * b
+        p = np.stack([r * np.cos(t), r * np.sin(t), zero], axis=1)
+        n, area = np.tile([0.0, 0, -1], (len(a), 1)), np.full(len(a), np.pi * size[0] ** 2)
+    elif kind == "sphere":
+        z, t = 2 * a - 1, 2 * np.pi * b
+        n = np.stack([np.sqrt(1 - z * z) * np.cos(t), np.sqrt(1 - z * z) * np.sin(t), z], axis=1)
+        p, area = size[0] * n, np.full(len(a), 4 * np.pi * size[0] ** 2)
+    else:
+        t = 2 * np.pi * b
+        n = np.stack([zero, np.cos(t), np.sin(t)], axis=1)
+        p = size[1] * n + np.stack([(a - 0.5) * size[0], zero, zero], axis=1)
+        area = np.full(len(a), 2 * np.pi * size[0] * size[1])
+    return p @ world[:3, :3].T + world[:3, 3], n @ world[:3, :3].T, area / len(a)
+
+
+def irradiance_by_sum(light, p) -> np.ndarray:
+    """On upward faces at p [n, 3], by summing over the light's surface."""
+    points, normals, areas = emitting_elements(light.kind, light.size, light.world_from_light)
+    result = []
+    for x in p:
+        d = points - x
+        r = np.linalg.norm(d, axis=1)
+        facing = np.maximum(-np.einsum("ij,ij->i", normals, d) / r, 0.0)
+        result.append(np.sum(np.maximum(d[:, 1] / r, 0.0) * facing / r**2 * areas))
+    return np.array(result)
+
+
+def turned(x_angle, y_angle, position) -> np.ndarray:
+    cx, sx, cy, sy = np.cos(x_angle), np.sin(x_angle), np.cos(y_angle), np.sin(y_angle)
+    m = np.eye(4)
+    m[:3, :3] = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]]) @ np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+    m[:3, 3] = position
+    return m
+
+
+@pytest.mark.parametrize(
+    ("kind", "size", "world", "error"),
+    [
+        ("rect", (1.5, 0.8), turned(-1.3, 0.4, (0.3, 2.0, 0.2)), 2e-3),
+        ("rect", (3.0, 2.0), turned(-0.4, 0.9, (0.0, 0.6, -1.0)), 5e-3),  # half below the ground
+        ("disk", (0.7,), turned(-1.2, 0.4, (0.3, 1.5, 0.2)), 5e-3),
+        ("sphere", (0.5,), turned(0.0, 0.0, (0.2, 1.5, 0.3)), 2e-3),
+        ("sphere", (0.8,), turned(0.0, 0.0, (1.2, 0.2, -1.5)), 1e-2),  # partly below the ground
+        # Its nearer edge is in front of the rectangle that stands for it: off by radius / distance.
+        ("cylinder", (2.0, 0.05), turned(0.0, 0.4, (0.3, 1.5, 0.2)), 0.05 / 1.5),
+    ],
+)
+def test_shape_lights_give_their_irradiance(kind, size, world, error):
+    light = LightData("/lamp", kind, (2.0, 1.0, 0.5), world, size=size)
+    scene = scene_of([(ground(), place(0.1, 0, 0), WHITE)], [light])
+    camera = look_at((0.0, 9.0, 0.1), (0, 0, 0), fov=50.0, size=(16, 12))
+    rgba, _, triangle, _ = picture_of(scene, camera)
+    d = eye_rays(camera)
+    p = camera.eye - (camera.eye[1] / d[:, 1])[:, None] * d
+    elements = emitting_elements(kind, size, world)[0]
+    # Where the light cuts the ground the sum is singular, and a sphere would be looked at from inside.
+    clear = np.linalg.norm(p[:, None] - elements[::7], axis=2).min(axis=1) > 0.3
+    if kind == "sphere":
+        clear &= np.linalg.norm(p - world[:3, 3], axis=1) > 1.2 * size[0]
+    expected = irradiance_by_sum(light, p[clear])[:, None] * np.array(light.color) / np.pi
+    assert (triangle >= 0).all() and clear.sum() > 120 and expected.max() > 0.02
+    np.testing.assert_allclose(rgba[clear, :3], expected, atol=error * expected.max())
+
+
+def test_sphere_light_above_a_facing_point_has_the_closed_form():
+    """E = pi L (r / d)^2, also where the ground is seen in a mirror."""
+    light = LightData("/lamp", "sphere", (3.0, 3.0, 3.0), place(0, 4, 0, 2.0), size=(0.5,))
+    scene = scene_of([(ground(), place(), WHITE)], [light])
+    camera = look_at((0.0, 3.0, 0.01), (0, 0, 0), fov=2.0, size=(3, 3))
+    rgba, *_ = picture_of(scene, camera)
+    assert rgba[4, 0] == pytest.approx(3.0 * (1.0 / 4.0) ** 2, rel=1e-3)
+
+
+def test_a_shape_light_alone_brings_no_default_sky():
+    light = LightData("/lamp", "rect", (1.0, 1.0, 1.0), turned(np.pi / 2, 0.0, (0, 2, 0)), size=(1.0, 1.0))
+    scene = scene_of([(ground(), place(), WHITE)], [light])
+    rgba, *_ = picture_of(scene, look_at((0, 5, 3), (0, 0, 0)))
+    assert not rgba[:, :3].any()  # it shines upwards, away from the ground
+
+
+def shadowed_ground(shadows):
+    """Ground under a slanted sun with a square card one unit above it: (rgb, points [n, 3] of the ground or NaN)."""
+    card = ground(0.5)
+    sun = distant((np.pi, np.pi, np.pi), (1.0, 2.0, 0.0))
+    scene = scene_of([(ground(), place(), WHITE), (card, place(0, 1, 0), WHITE)], [sun])
+    camera = look_at((0.0, 6.0, 6.0), (0, 0, 0), fov=40.0)
+    gbuffer = raster.draw_scene(scene, camera)
+    _, gbuffer.reflector_id = surface.mirror_pixels(scene, gbuffer, {})
+    picture = shade.shade(scene, gbuffer, {}, shadows=shadows)[0].numpy()
+    d = eye_rays(camera)
+    p = camera.eye - (camera.eye[1] / d[:, 1])[:, None] * d
+    return picture[:, 0], np.where((gbuffer.triangle.numpy() < 2)[:, None], p, np.nan)
+
+
+def test_shadows_fall_where_the_sun_says():
+    lit, p = shadowed_ground(False)
+    seen, _ = shadowed_ground(True)
+    cosine = 2.0 / np.sqrt(5.0)
+    inside = (np.abs(p[:, 0] + 0.5) < 0.48) & (np.abs(p[:, 2]) < 0.48)  # the card moved by 1 / 2 against the sun
+    outside = (np.abs(p[:, 0] + 0.5) > 0.52) | (np.abs(p[:, 2]) > 0.52)
+    assert inside.sum() > 15 and outside.sum() > 1500
+    np.testing.assert_allclose(lit[~np.isnan(p[:, 0])], cosine, rtol=1e-5)
+    assert not seen[inside].any()
+    np.testing.assert_allclose(seen[outside], cosine, rtol=1e-5)
+
+
+def test_shadows_are_seen_in_mirrors():
+    """A ground patch in a vertical mirror: with the card in the way it is black."""
+    silver = MaterialData(base_color=(1, 1, 1), metallic=1.0, roughness=0.0)
+    wall = MeshData(
+        points=np.float32([[-9, 0, -3], [9, 0, -3], [9, 9, -3], [-9, 9, -3]]),
+        triangles=np.int32([[0, 1, 2], [0, 2, 3]]),
+    )
+    sun = distant((np.pi, np.pi, np.pi), (0.0, 1.0, 0.0))
+    placed = [(ground(), place(), WHITE), (ground(1.0), place(0, 2, 0), WHITE), (wall, place(), silver)]
+    scene = scene_of(placed, [sun])
+    camera = look_at((0.0, 1.5, 1.0), (0, 0.9, -3), fov=50.0)
+    gbuffer = raster.draw_scene(scene, camera)
+    pixels, gbuffer.reflector_id = surface.mirror_pixels(scene, gbuffer, {1: 2})
+    layer = raytraced.reflect(scene, raytraced.Prepared(2, False), gbuffer, pixels[1], camera, Settings())
+    mirror = [shade.shade(scene, gbuffer, {1: layer}, shadows=on)[1].numpy()[:, 0] for on in (False, True)]
+    index = pixels[1].pixel.numpy()
+    on_ground = layer.triangle.numpy() // 2 == 0
+    p = layer.pixels.point.numpy() + layer.distance.numpy()[:, None] * layer.pixels.direction.numpy() + scene.origin
+    under = on_ground & (np.abs(p[:, 0]) < 0.98) & (np.abs(p[:, 2]) < 0.98)
+    free = on_ground & ((np.abs(p[:, 0]) > 1.02) | (np.abs(p[:, 2]) > 1.02))
+    assert under.sum() > 10 and free.sum() > 100
+    np.testing.assert_allclose(mirror[0][index[on_ground]], 1.0, atol=1e-4)
+    assert not mirror[1][index[under]].any()
+    np.testing.assert_allclose(mirror[1][index[free]], 1.0, atol=1e-4)

@@ -180,7 +180,7 @@ def render_frame(scene: Scene, plan: Plan, camera: str | Camera | None = None, p
                 _history(previous, scene, row.reflector.id),
             )
     with timer("shade"):
-        picture = shade.shade(scene, gbuffer, layers, settings.threads)
+        picture = shade.shade(scene, gbuffer, layers, settings.threads, settings.shadows)
     timings = timer.ms
     for layer in layers.values():
         for step, ms in layer.timings.items():

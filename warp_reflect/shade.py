@@ -1,8 +1,9 @@
 """Deferred shading: the picture from the G-buffer and the reflectors' layers.
 
-Approximates UsdPreviewSurface under dome and distant lights, without shadows:
+Approximates UsdPreviewSurface, textures included (`textures.py`):
 
-* base: Lambert under the dome's irradiance (its first nine spherical harmonics) and the distant lights;
+* base: Lambert under the dome's irradiance (its first nine spherical harmonics), the distant lights, which cast
+  shadows on demand, and the unshadowed shapes that emit (`direct.py`);
 * mirror term: Schlick's Fresnel between F0 and F90 at the angle of incidence, and the white clear coat on top
   of it, times the radiance from the reflected direction. At a reflector that is the surface its layer names;
   elsewhere, and for a mirror seen in a mirror, the dome;
@@ -22,10 +23,11 @@ import numpy as np
 import warp as wp
 
 from warp_reflect import launch
+from warp_reflect.direct import AREA_KINDS, DirectView, direct_irradiance, prepare_direct
 from warp_reflect.layers import CameraView, GBuffer, ReflectionLayer, eye_ray_direction, eye_ray_origin
-from warp_reflect.scene import SHAPE_QUADRIC, LightData, Scene, SceneView
-from warp_reflect.shapes import clamp_weights, facet_normal, intersect_triangle, unit
-from warp_reflect.surface import shading_normal
+from warp_reflect.scene import SHAPE_QUADRIC, Scene, SceneView
+from warp_reflect.shapes import clamp_weights, intersect_triangle, unit
+from warp_reflect.surface import hit_normal
 from warp_reflect.textures import Look, plain_look, prepare_looks
 
 wp.set_module_options({"enable_backward": False})
@@ -38,6 +40,7 @@ DEFAULT_SLOPE = 0.3
 SHARP_ROUGHNESS = wp.constant(0.05)
 ROUGH_ROUGHNESS = wp.constant(0.3)
 PI = wp.constant(float(np.pi))
+LIGHT_KINDS = ("dome", "distant", *AREA_KINDS)
 
 
 @wp.struct
@@ -52,12 +55,6 @@ class DomeView:
 
 
 @wp.struct
-class DistantView:
-    to_light: wp.vec3  # unit
-    irradiance: wp.vec3  # on a facing surface
-
-
-@wp.struct
 class LightView:
     """All light of a scene. Directions have world axes."""
 
@@ -65,7 +62,7 @@ class LightView:
     sky_slope: wp.vec3  # grey radiance added in proportion to the direction's component along this vector
     domes: wp.array(dtype=DomeView)
     texels: wp.array(dtype=wp.vec3)
-    distant: wp.array(dtype=DistantView)
+    direct: DirectView
     # Irradiance of the textured domes on a surface of normal (x, y, z): a quadratic form.
     e_1: wp.vec3
     e_x: wp.vec3
@@ -109,7 +106,7 @@ def dome_moments(texture: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
 
 
 def prepare_lights(scene: Scene) -> LightView:
-    """The device form of a scene's lights; light kinds other than dome and distant are left out.
+    """The device form of a scene's lights; unknown kinds are left out.
 
     Source of the irradiance: Ramamoorthi and Hanrahan, An Efficient Representation for Irradiance Environment
     Maps, 2001, equation 8 (cosine lobe coefficients pi, 2 pi / 3, pi / 4). Differs from it by: moments of the
@@ -117,10 +114,9 @@ def prepare_lights(scene: Scene) -> LightView:
     and a matrix do.
     """
     domes = [light for light in scene.data.lights if light.kind == "dome"]
-    distant = [light for light in scene.data.lights if light.kind == "distant"]
     zeroth, first, second = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3, 3))
     sky, sky_slope = np.zeros(3), np.zeros(3)
-    if not domes and not distant:
+    if not any(light.kind in LIGHT_KINDS for light in scene.data.lights):
         sky[:] = DEFAULT_SKY
         sky_slope["XYZ".index(scene.data.up_axis)] = DEFAULT_SLOPE
     dome_views, texels, texel_count = [], [], 0
@@ -151,7 +147,7 @@ def prepare_lights(scene: Scene) -> LightView:
     lights.texels = wp.array(
         np.concatenate(texels) if texels else np.zeros((0, 3), np.float32), dtype=wp.vec3, device=device
     )
-    lights.distant = wp.array([_distant_view(light) for light in distant], dtype=DistantView, device=device)
+    lights.direct = prepare_direct(scene.data.lights, scene.origin, device)
     # E(n) = sum over l of A_l (2 l + 1) / (4 pi) * integral of L(d) P_l(n . d), A = (pi, 2 pi / 3, pi / 4).
     linear, quadratic = 0.5 * first, 15.0 / 32.0 * second
     lights.e_1 = wp.vec3(*((1.0 / 4.0 - 5.0 / 32.0) * zeroth))
@@ -167,13 +163,6 @@ def _rotation(matrix: np.ndarray) -> np.ndarray:
     """The rotation of a light's transform: its axes at unit length."""
     axes = np.asarray(matrix, np.float64)[:3, :3]
     return axes / np.linalg.norm(axes, axis=0)
-
-
-def _distant_view(light: LightData) -> DistantView:
-    view = DistantView()
-    view.to_light = wp.vec3(*_rotation(light.world_from_light)[:, 2])
-    view.irradiance = wp.vec3(*light.color)
-    return view
 
 
 @wp.func
@@ -213,8 +202,8 @@ def dome_radiance(lights: LightView, direction: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def irradiance(lights: LightView, n: wp.vec3) -> wp.vec3:
-    """Irradiance of all lights on a surface of unit normal n."""
+def dome_irradiance(lights: LightView, n: wp.vec3) -> wp.vec3:
+    """Irradiance of all domes on a surface of unit normal n."""
     grey = (2.0 * PI / 3.0) * wp.dot(lights.sky_slope, n)
     total = PI * lights.sky + wp.vec3(grey, grey, grey)
     if lights.domes.shape[0] > 0:
@@ -223,8 +212,21 @@ def irradiance(lights: LightView, n: wp.vec3) -> wp.vec3:
         e += n[1] * (n[1] * lights.e_yy + n[2] * lights.e_yz) + n[2] * n[2] * lights.e_zz
         # A small bright sun drives nine coefficients below zero on its far side.
         total += wp.vec3(wp.max(e[0], 0.0), wp.max(e[1], 0.0), wp.max(e[2], 0.0))
-    for k in range(lights.distant.shape[0]):
-        total += wp.max(wp.dot(n, lights.distant[k].to_light), 0.0) * lights.distant[k].irradiance
+    return total
+
+
+@wp.func
+def irradiance_at(lights: LightView, direct: wp.array(dtype=wp.vec3), i: int, n: wp.vec3) -> wp.vec3:
+    """Irradiance of all lights on a surface of unit normal n; `direct` has point i's share of all but the domes.
+
+    Where `direct` is empty there are only domes and distant lights, without shadows.
+    """
+    total = dome_irradiance(lights, n)
+    if direct.shape[0] > 0:
+        return total + direct[i]
+    for k in range(lights.direct.distant.shape[0]):
+        cosine = wp.max(wp.dot(n, lights.direct.distant[k].to_light), 0.0)
+        total += cosine * lights.direct.distant[k].irradiance
     return total
 
 
@@ -245,10 +247,10 @@ def schlick(f0: wp.vec3, f90: wp.vec3, cosine: float) -> wp.vec3:
 
 
 @wp.func
-def split_lobes(lights: LightView, look: Look, n: wp.vec3, cosine: float, reflector: bool) -> Lobes:
+def split_lobes(look: Look, irradiance: wp.vec3, cosine: float, reflector: bool) -> Lobes:
     """Base radiance and mirror weight of a surface.
 
-    `n` is its unit normal on the viewer's side, `cosine` that of the angle of incidence.
+    `irradiance` is that of the viewer's side, `cosine` that of the angle of incidence.
     """
     sharp = wp.clamp((ROUGH_ROUGHNESS - look.roughness) / (ROUGH_ROUGHNESS - SHARP_ROUGHNESS), 0.0, 1.0)
     if reflector:
@@ -265,29 +267,9 @@ def split_lobes(lights: LightView, look: Look, n: wp.vec3, cosine: float, reflec
         albedo = (1.0 - coat) * albedo
         mirror = (1.0 - coat) * mirror + wp.vec3(coat, coat, coat)
     lobes = Lobes()
-    lobes.base = look.emissive + wp.cw_mul(albedo, (1.0 / PI) * irradiance(lights, n))
+    lobes.base = look.emissive + wp.cw_mul(albedo, (1.0 / PI) * irradiance)
     lobes.mirror = mirror
     return lobes
-
-
-@wp.func
-def hit_normal(scene: SceneView, triangle: int, u: float, v: float) -> wp.vec3:
-    """Unit normal to shade with: interpolated, or of the analytic surface, or the facet's; not turned."""
-    if scene.normal_index[triangle][0] >= 0:
-        # The last argument counts where the corners' normals cancel.
-        return shading_normal(scene, triangle, u, v, wp.vec3(0.0, 0.0, 1.0))
-    tri = scene.triangles[triangle]
-    v0 = scene.points[tri[0]]
-    v1 = scene.points[tri[1]]
-    v2 = scene.points[tri[2]]
-    patch = scene.triangle_patch[triangle]
-    if scene.patches[patch].shape != SHAPE_QUADRIC:
-        return facet_normal(v0, v1, v2)
-    m = scene.patches[patch].unit_from_scene
-    q = wp.transform_point(m, (1.0 - u - v) * v0 + u * v1 + v * v2)
-    abc = scene.patches[patch].quadric
-    gradient = wp.vec3(q[0], q[1], abc[0] * q[2] + 0.5 * abc[1])
-    return unit(wp.transform_vector(wp.transpose(m), gradient))
 
 
 @wp.func
@@ -303,6 +285,7 @@ def hit_radiance(
     scene: SceneView,
     lights: LightView,
     looks: wp.array(dtype=Look),
+    direct: wp.array(dtype=wp.vec3),
     i: int,
     triangle: int,
     u: float,
@@ -324,7 +307,7 @@ def hit_radiance(
             look = looks[i]
         else:
             look = plain_look(scene, triangle, u, v)
-        lobes = split_lobes(lights, look, n, wp.abs(cosine), False)
+        lobes = split_lobes(look, irradiance_at(lights, direct, i, n), wp.abs(cosine), False)
         base = lobes.base
         weight = lobes.mirror
     if wp.max(weight) > 0.0:
@@ -339,6 +322,7 @@ def shade_kernel(
     camera: CameraView,
     lights: LightView,
     looks: wp.array(dtype=Look),
+    direct: wp.array(dtype=wp.vec3),
     triangle: wp.array(dtype=int),
     reflector_id: wp.array(dtype=int),
     # Outputs:
@@ -380,7 +364,7 @@ def shade_kernel(
             look = looks[i]
         else:
             look = plain_look(scene, tri, uv[0], uv[1])
-        lobes = split_lobes(lights, look, n, wp.abs(cosine), reflector)
+        lobes = split_lobes(look, irradiance_at(lights, direct, i, n), wp.abs(cosine), reflector)
         base = lobes.base
         weight = lobes.mirror
         coverage = float(1.0)
@@ -399,6 +383,7 @@ def mirror_term_kernel(
     scene: SceneView,
     lights: LightView,
     looks: wp.array(dtype=Look),
+    direct: wp.array(dtype=wp.vec3),
     pixel: wp.array(dtype=int),
     direction: wp.array(dtype=wp.vec3),
     triangle: wp.array(dtype=int),
@@ -411,14 +396,14 @@ def mirror_term_kernel(
     """One thread per mirror pixel; finds the mirror's weight in `out_mirror`."""
     i = first + wp.tid()
     p = pixel[i]
-    seen = hit_radiance(scene, lights, looks, i, triangle[i], u[i], v[i], direction[i])
+    seen = hit_radiance(scene, lights, looks, direct, i, triangle[i], u[i], v[i], direction[i])
     term = wp.cw_mul(out_mirror[p], seen)
     out_mirror[p] = term
     out_picture[p] += wp.vec4(term[0], term[1], term[2], 0.0)
 
 
 def shade(
-    scene: Scene, gbuffer: GBuffer, layers: Mapping[int, ReflectionLayer], threads: int = 0
+    scene: Scene, gbuffer: GBuffer, layers: Mapping[int, ReflectionLayer], threads: int = 0, shadows: bool = False
 ) -> tuple[wp.array, wp.array]:
     """The picture of a frame.
 
@@ -427,6 +412,7 @@ def shade(
         gbuffer: With its `reflector_id` set.
         layers: The answer of every reflector that `reflector_id` names.
         threads: CPU threads; 0: one per core.
+        shadows: Distant lights cast shadows, directly seen and in mirrors.
 
     Returns:
         (linear RGB radiance and coverage, vec4 [height * width]; the reflectors' mirror term alone, vec3
@@ -438,11 +424,14 @@ def shade(
     picture = wp.empty(count, dtype=wp.vec4, device=device)
     mirror = wp.empty(count, dtype=wp.vec3, device=device)
     looks = prepare_looks(scene, gbuffer, None, threads)
-    inputs = [scene.view, gbuffer.view, lights, looks, gbuffer.triangle, gbuffer.reflector_id, picture, mirror]
+    direct = direct_irradiance(scene, lights.direct, gbuffer, None, shadows, threads)
+    inputs = [scene.view, gbuffer.view, lights, looks, direct, gbuffer.triangle, gbuffer.reflector_id, picture, mirror]
     launch.launch(shade_kernel, count, inputs, device, threads)
     for layer in layers.values():
         pixels = layer.pixels
-        inputs = [scene.view, lights, prepare_looks(scene, gbuffer, layer, threads), pixels.pixel, pixels.direction]
+        looks = prepare_looks(scene, gbuffer, layer, threads)
+        direct = direct_irradiance(scene, lights.direct, gbuffer, layer, shadows, threads)
+        inputs = [scene.view, lights, looks, direct, pixels.pixel, pixels.direction]
         inputs += [layer.triangle, layer.u, layer.v, picture, mirror]
         launch.launch(mirror_term_kernel, pixels.count, inputs, device, threads)
     return picture, mirror

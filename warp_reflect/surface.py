@@ -47,6 +47,26 @@ def shading_normal(scene: SceneView, triangle: int, u: float, v: float, facet: w
 
 
 @wp.func
+def hit_normal(scene: SceneView, triangle: int, u: float, v: float) -> wp.vec3:
+    """Unit normal to shade with: interpolated, or of the analytic surface, or the facet's; not turned."""
+    if scene.normal_index[triangle][0] >= 0:
+        # The last argument counts where the corners' normals cancel.
+        return shading_normal(scene, triangle, u, v, wp.vec3(0.0, 0.0, 1.0))
+    tri = scene.triangles[triangle]
+    v0 = scene.points[tri[0]]
+    v1 = scene.points[tri[1]]
+    v2 = scene.points[tri[2]]
+    patch = scene.triangle_patch[triangle]
+    if scene.patches[patch].shape != SHAPE_QUADRIC:
+        return facet_normal(v0, v1, v2)
+    m = scene.patches[patch].unit_from_scene
+    q = wp.transform_point(m, (1.0 - u - v) * v0 + u * v1 + v * v2)
+    abc = scene.patches[patch].quadric
+    gradient = wp.vec3(q[0], q[1], abc[0] * q[2] + 0.5 * abc[1])
+    return unit(wp.transform_vector(wp.transpose(m), gradient))
+
+
+@wp.func
 def polish(scene: SceneView, triangle: int, p: wp.vec3, direction: wp.vec3) -> wp.vec4:
     """Move a point near a facet along its ray onto the analytic surface behind the facet.
 

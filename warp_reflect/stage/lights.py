@@ -14,7 +14,7 @@ from warp_reflect.stage.textures import resolve_asset, unpacked
 
 DEFAULT_LIGHT_PATH = "/__default dome"
 DEFAULT_DOME_RADIANCE = 0.5  # grey that leaves white surfaces below the display's white, and mirrors readable
-SHADED_KINDS = ("dome", "distant")  # what shade.py lights the picture with; the others are noted
+SHADED_KINDS = ("dome", "distant", "sphere", "rect", "disk", "cylinder")  # what shade.py uses; others are noted
 
 DOMES = ("DomeLight", "DomeLight_1")
 SHAPES = {
