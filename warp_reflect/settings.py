@@ -77,7 +77,7 @@ class Settings:
     """Interpolation grid: solved nodes as a fraction of the vertices; 0: every vertex is searched."""
     grid_kind: str = "direction"
     """What the grid holds: `direction` (one exact step a vertex) or `position` (the paper's virtual positions)."""
-    edge_px: float = 0.5
+    edge_px: float = 0.25
     """Virtual triangles are cut until a straight edge's picture bends by less than this; 0: never cut. [pixels]"""
     refine: str = "exact"
     """`exact` (every pixel gets the hit of an exact ray-triangle test) or `off` (the papers' picture)."""

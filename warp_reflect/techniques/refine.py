@@ -25,9 +25,6 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FINITE_FL
 CONVERGED = wp.constant(int(Status.CONVERGED))
 SKY = wp.constant(int(Status.SKY))
 
-# Of the test of a neighbouring pixel's triangle: it reaches into this pixel itself, or by a triangle or two further.
-SECOND_HOPS = wp.constant(2)
-
 # Who settled a pixel.
 DOUBT = wp.constant(0)
 CANDIDATE = wp.constant(1)
@@ -200,7 +197,7 @@ def settle_kernel(
                 separate = patches[other] != patch and near > NEARER_SHARE * depth
                 if other != tested and (separate or bend > FINE_STEP * depth):
                     tested = other
-                    second = walk(scene, neighbours, point[i], direction[i], parents[other], SECOND_HOPS)
+                    second = walk(scene, neighbours, point[i], direction[i], parents[other], hop_count)
                     if second.triangle >= 0 and second.t < hit.t:
                         if second.turned != 0:
                             return
