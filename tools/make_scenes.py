@@ -1,7 +1,7 @@
 """Write the stages of `usd_scenes/`: small, original, one reflection effect or one paper scene each.
 
 `python tools/make_scenes.py [--out DIR] [--only NAME] [--scale K] [--large DIR]`; from a benchmark:
-`make_scenes.build("kitchen", "/tmp/kitchen.usdc", scale=4)`.
+`make_scenes.build("kitchen", "kitchen.usdc", scale=4)`.
 
 Lengths are metres, +Y is up, colours linear Rec.709; two runs write the same bytes. `scale` multiplies the
 segments along each direction of every mesh, so triangles grow with its square. Shared objects are files of

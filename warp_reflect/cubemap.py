@@ -11,6 +11,8 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
+from warp_reflect.shapes import max_abs
+
 wp.set_module_options({"enable_backward": False})
 
 FACE_COUNT = 6
@@ -23,11 +25,6 @@ class CubePoint:
     face: int
     u: float
     v: float
-
-
-@wp.func
-def max_abs(x: wp.vec3) -> float:
-    return wp.max(wp.abs(x[0]), wp.max(wp.abs(x[1]), wp.abs(x[2])))
 
 
 @wp.func

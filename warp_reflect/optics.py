@@ -63,34 +63,10 @@ def tangent_basis(n: Any):
 
 
 @wp.func
-def reflect_direction(d: Any, n: Any):
-    """Direction `d` reflected at a surface with unit normal `n` (either sign); the length is kept."""
-    s = wp.dot(d, n)
-    return d - (s + s) * n
-
-
-@wp.func
 def mirror_point(x: Any, p: Any, n: Any):
     """`x` mirrored at the plane through `p` with unit normal `n` (Householder form, exact for any normal)."""
     s = wp.dot(x - p, n)
     return x - (s + s) * n
-
-
-@wp.func
-def specular_angle(p: Any, n: Any, eye: Any, target: Any):
-    """Angle between the half vector and the normal, in radians, [0, pi]; 0 at a reflection point.
-
-    The half vector stays unnormalised, so that the angle is resolved down to the rounding of the directions
-    (1e-7 in float32) where 1 - cos is blind below 3.5e-4. pi where eye, `p` and target are in line, or where
-    one of the directions does not exist.
-    """
-    w = safe_normalize(eye - p) + safe_normalize(target - p)
-    w_n = wp.dot(w, n)
-    w_t = w - w_n * n
-    tangential = wp.length(w_t)
-    if not (tangential + wp.abs(w_n) > n.dtype(0.0)):
-        return n.dtype(PI)
-    return wp.atan2(tangential, w_n)
 
 
 @wp.func
@@ -113,22 +89,6 @@ def specular_residual(p: Any, n: Any, eye: Any, target: Any):
         return n.dtype(1.0)
     tangential = wp.length(w_t)
     return tangential / wp.sqrt(tangential * tangential + w_n * w_n)
-
-
-@wp.func
-def virtual_point_ray(p: Any, eye: Any, target: Any):
-    """Where the eye sees `target`: on the ray from the eye through `p`, as far behind `p` as the target is.
-
-    Its distance from the eye is the path length, stationary in `p`; a tangential error e of `p` moves it by e
-    over the eye's distance on the screen. `p` itself where eye and `p` coincide.
-    """
-    return p + safe_length(target - p) * safe_normalize(p - eye)
-
-
-@wp.func
-def virtual_point_mirror(p: Any, n: Any, target: Any):
-    """Mirror image of `target` in the tangent plane; equals the ray form at the exact point."""
-    return mirror_point(target, p, n)
 
 
 @wp.func

@@ -207,7 +207,6 @@ class MaterialView:
     base_color: wp.vec3
     f0: wp.vec3  # mirror weight at normal incidence
     f90: wp.vec3
-    diffuse: wp.vec3  # Lambert albedo, (1 - metallic) applied
     emissive: wp.vec3
     metallic: float
     roughness: float
@@ -489,8 +488,6 @@ def material_view(material: MaterialData) -> MaterialView:
     view.base_color = wp.vec3(*material.base_color)
     view.f0 = wp.vec3(*f0)
     view.f90 = wp.vec3(*f90)
-    kept = 1.0 if material.specular_workflow else 1.0 - material.metallic
-    view.diffuse = wp.vec3(*(kept * np.asarray(material.base_color)))
     view.emissive = wp.vec3(*material.emissive)
     view.metallic = 0.0 if material.specular_workflow else material.metallic
     view.roughness = material.roughness

@@ -6,10 +6,11 @@ from typing import Any
 
 import warp as wp
 
-from warp_reflect.cubemap import max_abs, project_to_cube
+from warp_reflect.cubemap import project_to_cube
 from warp_reflect.optics import specular_residual, virtual_point
 from warp_reflect.reflector_maps import ReflectorMapView, sample_map
 from warp_reflect.settings import Status
+from warp_reflect.shapes import max_abs
 from warp_reflect.solve_device import finite, to_double
 from warp_reflect.techniques.reflector_map import (
     ACCEPTED,

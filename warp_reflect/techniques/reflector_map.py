@@ -19,12 +19,13 @@ import numpy as np
 import warp as wp
 
 from warp_reflect.bodies import weld
-from warp_reflect.cubemap import max_abs, project_to_cube
+from warp_reflect.cubemap import project_to_cube
 from warp_reflect.launch import launch
 from warp_reflect.layers import Camera, CameraView, GBuffer, MirrorPixels, ReflectionLayer, Reflector, project
 from warp_reflect.reflector_maps import MapSample, ReflectorMap, ReflectorMapView, sample_map
 from warp_reflect.scene import PartRange, Scene
 from warp_reflect.settings import Settings, Status, Technique
+from warp_reflect.shapes import max_abs
 from warp_reflect.techniques import forward, grid
 from warp_reflect.techniques.forward import SolveFrame, VertexView, edge_reach, virtual_vertex
 from warp_reflect.techniques.grid import GridView, corner_weight
