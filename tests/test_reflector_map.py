@@ -6,10 +6,10 @@ import warp as wp
 
 import warp_reflect as wr
 from warp_reflect.bodies import analyse
-from warp_reflect.reflector_maps import ReflectorMap
+from warp_reflect.reflector_maps import ReflectorMap, ReflectorMapView
 from warp_reflect.settings import Settings, Status
-from warp_reflect.techniques import reflector_map
-from warp_reflect.techniques.reflector_map import SearchResult, SearchSettings
+from warp_reflect.techniques import map_search
+from warp_reflect.techniques.map_search import SearchResult, SearchSettings
 
 wp.set_module_options({"enable_backward": False})
 
@@ -17,7 +17,7 @@ wp.set_module_options({"enable_backward": False})
 @wp.kernel
 def probe_kernel(
     first: int,
-    map: reflector_map.ReflectorMapView,
+    map: ReflectorMapView,
     eye: wp.array(dtype=wp.vec3),
     target: wp.array(dtype=wp.vec3),
     settings: SearchSettings,
@@ -25,9 +25,9 @@ def probe_kernel(
     out_visible: wp.array(dtype=int),
 ):
     i = first + wp.tid()
-    out_visible[i] = wp.where(reflector_map.is_visible(map, eye[i], target[i]), 1, 0)
-    seed = reflector_map.first_guess(map, eye[i], target[i])
-    out[i] = reflector_map.search(map, eye[i], target[i], seed, settings)
+    out_visible[i] = wp.where(map_search.is_visible(map, eye[i], target[i]), 1, 0)
+    seed = map_search.first_guess(map, eye[i], target[i])
+    out[i] = map_search.search(map, eye[i], target[i], seed, settings)
 
 
 def probe(drawn, eye, target, settings):
@@ -36,7 +36,7 @@ def probe(drawn, eye, target, settings):
     unit = [wp.array((x @ m[:3, :3].T + m[:3, 3]).astype(np.float32), dtype=wp.vec3) for x in (eye, target)]
     out = wp.zeros(len(eye), dtype=SearchResult)
     visible = wp.zeros(len(eye), dtype=int)
-    chosen = reflector_map.search_settings(settings, drawn.resolution)
+    chosen = map_search.search_settings(settings, drawn.resolution)
     wp.launch(probe_kernel, dim=len(eye), inputs=[0, drawn.view, *unit, chosen, out, visible])
     result = out.numpy()
     points = (result["p"].astype(np.float64) - m[:3, 3]) @ np.linalg.inv(m[:3, :3]).T

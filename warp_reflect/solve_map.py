@@ -12,7 +12,7 @@ from warp_reflect.reflector_maps import ReflectorMapView, sample_map
 from warp_reflect.settings import Status
 from warp_reflect.shapes import max_abs
 from warp_reflect.solve_device import finite, to_double
-from warp_reflect.techniques.reflector_map import (
+from warp_reflect.techniques.map_search import (
     ACCEPTED,
     GAUGE_INSIDE,
     SearchSettings,

@@ -27,7 +27,7 @@ from warp_reflect.solve_general import solve_general_kernel
 from warp_reflect.solve_map import solve_map_kernel
 from warp_reflect.solve_plane import solve_plane_kernel
 from warp_reflect.solve_qim import solve_qim_kernel
-from warp_reflect.techniques.reflector_map import search_settings
+from warp_reflect.techniques.map_search import search_settings
 
 MAX_PAIRS = 2**31 - 1  # elements of one launch: kernels index with 32-bit integers
 

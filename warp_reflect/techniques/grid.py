@@ -13,7 +13,21 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from warp_reflect.cubemap import project_to_cube
+from warp_reflect.launch import launch
+from warp_reflect.layers import Camera, CameraView, project
+from warp_reflect.reflector_maps import ReflectorMap, ReflectorMapView, sample_map
 from warp_reflect.scene import PartRange, Scene
+from warp_reflect.settings import Settings, Status
+from warp_reflect.techniques.forward import SolveFrame, VertexView, edge_reach, virtual_vertex
+from warp_reflect.techniques.map_search import (
+    ACCEPTED,
+    SearchSettings,
+    measure,
+    newton_step,
+    solve_vertex,
+    step_on_cube,
+)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -21,6 +35,13 @@ CORNER_COUNT = 8
 FIT_STEPS = 14  # bisections of a cell size over FIT_SPAN: within 1 % of the share asked
 FIT_SPAN = 1.0e3  # from the mesh's extent down to this part of it
 CELL_LIMIT = 1 << 20  # cells along an axis; keeps cell numbers inside int64
+RESIDUAL_MAX = wp.constant(0.1)  # of an interpolated direction; one step squares it to below 1e-2 of itself
+# Pixels. Virtual positions of a cell whose interpolation is estimated to be wrong by more are not interpolated: a cell as
+# large as the mirror would say nothing. The paper's own grids are wrong by about as much.
+POSITION_PX = 4.0
+SPACE_DIAGONAL = wp.constant(1.7320508)  # of a cube with edge 1
+CONVERGED = wp.constant(int(Status.CONVERGED))
+HIDDEN = wp.constant(int(Status.HIDDEN))
 
 
 @wp.struct
@@ -53,6 +74,84 @@ def corner_weight(local: wp.vec3, corner: int) -> float:
     y = wp.where((corner & 2) != 0, local[1], 1.0 - local[1])
     z = wp.where((corner & 4) != 0, local[2], 1.0 - local[2])
     return x * y * z
+
+
+@wp.kernel
+def interpolate_kernel(
+    first: int,
+    # Scene:
+    points: wp.array(dtype=wp.vec3),
+    own_first: int,
+    own_count: int,
+    # Reflector:
+    map: ReflectorMapView,
+    frame: SolveFrame,
+    camera: CameraView,
+    settings: SearchSettings,
+    # Grid:
+    grid_view: GridView,
+    node: VertexView,
+    position_root: float,
+    # Outputs:
+    out_vertex: VertexView,
+):
+    """One thread per scene vertex: interpolated from its cell's solved corners, or solved where that is unsafe."""
+    i = first + wp.tid()
+    if i >= own_first and i < own_first + own_count:
+        return
+    target = frame.unit_from_scene * points[i] + frame.unit_offset
+    cell = int(-1)
+    if i < grid_view.vertex_cell.shape[0]:  # beyond: vertices of cut triangles
+        cell = grid_view.vertex_cell[i]
+    x = wp.vec3(0.0, 0.0, 0.0)
+    position = wp.vec3(0.0, 0.0, 0.0)
+    solved = int(0)
+    hidden = int(0)
+    shortest = float(1.0e30)
+    if cell >= 0:
+        local = grid_view.vertex_local[i]
+        for k in range(8):
+            corner = grid_view.cell_nodes[cell, k]
+            status = int(node.status[corner])
+            if status == CONVERGED:
+                solved += 1
+                weight = corner_weight(local, k)
+                seed = node.seed[corner]
+                x += weight * seed
+                if position_root > 0.0:
+                    position += weight * node.position[corner]
+                    shortest = wp.min(shortest, node.reach[corner])
+            elif status == HIDDEN:
+                hidden += 1
+    if hidden == 8:
+        # What lies behind a convex body is convex: so does the whole cell.
+        out_vertex.status[i] = wp.uint8(HIDDEN)
+        out_vertex.screen[i] = wp.vec4(0.0, 0.0, -1.0, 0.0)
+        return
+    if solved == 8:
+        first_corner = grid_view.nodes[grid_view.cell_nodes[cell, 0]]
+        last_corner = grid_view.nodes[grid_view.cell_nodes[cell, 7]]
+        diagonal = wp.length(frame.unit_from_scene * (last_corner - first_corner))
+        if position_root > 0.0 and diagonal < SPACE_DIAGONAL * shortest * position_root:
+            out_vertex.status[i] = wp.uint8(CONVERGED)
+            out_vertex.screen[i] = project(camera, position)
+            return
+        x = project_to_cube(x)
+        sample = sample_map(map, x)
+        r = measure(sample, x, frame.eye, target)
+        if position_root == 0.0 and r.residual < RESIDUAL_MAX:
+            x = step_on_cube(map, r, newton_step(sample, frame.eye, target), 1.0)
+            # Read again: a tangent step leaves the body by its sagitta, which coarse cells make visible.
+            sample = sample_map(map, x)
+            r = measure(sample, x, frame.eye, target)
+            if r.residual < ACCEPTED:
+                out_vertex.seed[i] = x
+                out_vertex.residual[i] = r.residual
+                out_vertex.status[i] = wp.uint8(CONVERGED)
+                out_vertex.reach[i] = edge_reach(frame, r.p, r.n, target, map.least_curvature)
+                out_vertex.screen[i] = project(camera, virtual_vertex(frame, r.p, r.n, target))
+                return
+    solve_vertex(map, frame, camera, settings, target, wp.vec3(0.0, 0.0, 0.0), i, out_vertex)
 
 
 def build(scene: Scene, own: PartRange, share: float) -> Grid:
@@ -155,3 +254,33 @@ def _cells(points, low, size):
     lattice = np.stack([numbers % wide[0], numbers // wide[0] % wide[1], numbers // (wide[0] * wide[1])], 1)
     local = np.clip((points - low) / size - index, 0.0, 1.0)
     return low + lattice * size, corners.reshape(-1, CORNER_COUNT), cell.reshape(-1), local
+
+
+def interpolate(
+    scene: Scene,
+    cells: Grid,
+    node: VertexView,
+    points: wp.array,
+    own: list[int],
+    map: ReflectorMap,
+    frame: SolveFrame,
+    view: CameraView,
+    search: SearchSettings,
+    camera: Camera,
+    settings: Settings,
+    out_vertex: VertexView,
+) -> None:
+    """Fill the vertices of a scene from the solved nodes of a grid.
+
+    Args:
+        node: Solved nodes of `cells`, with positions where `settings.grid_kind` is "position".
+        points: vec3 [n], scene frame; the scene's own vertices come first.
+        own: [first, count] of the mirror's own vertices, see `forward.own_vertices`.
+        map: The reflector, for the exact step and for vertices that are solved after all.
+        camera: What `view` was made from.
+        out_vertex: One entry per point.
+    """
+    positions = settings.grid_kind == "position"
+    root = float(np.sqrt(POSITION_PX / max(camera.fx, camera.fy))) if positions else 0.0
+    inputs = [points, *own, map.view, frame, view, search, cells.view, node, root, out_vertex]
+    launch(interpolate_kernel, len(points), inputs, scene.device, settings.threads)

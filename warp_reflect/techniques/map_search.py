@@ -1,0 +1,422 @@
+"""The search for a reflection point in a reflector map: device functions and the solution of one virtual vertex.
+
+Source: Estalella, Martin, Drettakis, Tost, Devillers, Cazals, "Accurate Interactive Specular Reflections on Curved
+Objects" (2005), sections 4.2-4.3 (search) and 6.1 (hidden vertices). What differs:
+- the default search is Newton's method on the tangential bisector over its normal part, with the surface derivatives of
+  the same four texels; the paper's midpoint search is `search="midpoint"`;
+- the residual is the angle's tangent, not E = (1 - B.N) / 2, which loses all angles below 3.4e-4 in float32;
+- a vertex behind the reflector is recognised by the body's gauge along the eye's line of sight, which is convex for a
+  convex body.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from warp_reflect.cubemap import project_to_cube
+from warp_reflect.layers import CameraView, project
+from warp_reflect.reflector_maps import MapSample, ReflectorMapView, sample_map
+from warp_reflect.settings import Settings, Status
+from warp_reflect.shapes import max_abs
+from warp_reflect.techniques.forward import SolveFrame, VertexView, edge_reach, virtual_vertex
+
+wp.set_module_options({"enable_backward": False})
+
+# Sines. Of the residual at which a search stops where no tolerance is set: the float32 floor of the residual is
+# 4e-8 to 3e-7, and 0.1 h^2 is the map's own error at texel size h.
+TOLERANCE_MIN = 2.0e-6
+TOLERANCE_MAX = 1.0e-5
+ACCEPTED = wp.constant(1.0e-3)  # residual above which an answer is MAX_ITERATIONS rather than CONVERGED
+NEWTON_EVALUATIONS = 12  # cold starts need 3-6; what is left after 12 takes the coarse seed
+MIDPOINT_ITERATIONS = 9  # the paper's best setting (figure 8)
+STEP_CAP = wp.constant(0.7)  # of the whitened radius; keeps a Newton step on the visible side
+RETRY_SHRINK = wp.constant(0.4)
+SHRINK_MIN = wp.constant(1.0e-3)  # a step shortened to this share lowers nothing any more
+NORMAL_PART_MIN = wp.constant(1.0e-3)  # of |o + v|; below it the residual's tangent is not trusted
+SPD_SHARE = wp.constant(0.05)  # det J below this share of det H: take the safe step
+COARSE_NODES = wp.constant(7)  # per face edge of the fallback seed
+GAUGE_STEPS = wp.constant(10)  # of the bracket that finds the least gauge along a line of sight
+GAUGE_INSIDE = wp.constant(1.0e-4)  # gauge margin inside which a point counts as on the surface
+MIDPOINT_STEP = wp.constant(0.5)  # first step, in units where the field of a sphere is the angle
+MIDPOINT_DELTA = wp.constant(0.5)  # |b_m - b| / |b| steered to; best factor per step of the midpoint rule
+GRAZING_COS = wp.constant(0.1)  # cosine of incidence below which a search without a root lies on the silhouette
+SEARCH_MIDPOINT = wp.constant(1)
+CONVERGED = wp.constant(int(Status.CONVERGED))
+HIDDEN = wp.constant(int(Status.HIDDEN))
+MAX_ITERATIONS = wp.constant(int(Status.MAX_ITERATIONS))
+
+
+@wp.struct
+class SearchResult:
+    x: wp.vec3  # cube point
+    p: wp.vec3
+    n: wp.vec3
+    residual: float  # tangent of the angle between bisector and normal
+    cos_eye: float
+    cos_target: float
+    evaluations: int
+
+
+@wp.func
+def is_visible(map: ReflectorMapView, eye: wp.vec3, target: wp.vec3) -> bool:
+    """True where the segment from eye to target misses the body and the target lies outside it.
+
+    The gauge along the segment is convex and the sign of its slope is that of N . (target - eye): its least value is
+    found by bisection. Most segments are decided by the balls inside and around the whitened body.
+    """
+    o = wp.cw_mul(eye, map.inv_extent)
+    v = wp.cw_mul(target, map.inv_extent)
+    d = v - o
+    t = wp.clamp(-wp.dot(o, d) / wp.max(wp.dot(d, d), 1.0e-30), 0.0, 1.0)
+    nearest = wp.length(o + t * d)
+    if nearest > map.outer_radius:
+        return True
+    if nearest < map.inner_radius:
+        return False
+    direction = target - eye
+    low = float(0.0)
+    high = float(1.0)
+    for _ in range(GAUGE_STEPS):
+        w = o + t * d
+        s = sample_map(map, project_to_cube(w))
+        if wp.length(w) < (1.0 + GAUGE_INSIDE) * wp.length(wp.cw_mul(s.p, map.inv_extent)):
+            return False
+        if wp.dot(s.n, direction) < 0.0:
+            low = t
+        else:
+            high = t
+        # At the target end the slope still falls: the target itself is the nearest point, and it is outside.
+        if low >= 1.0 or high <= 0.0:
+            return True
+        t = 0.5 * (low + high)
+    return True
+
+
+@wp.func
+def first_guess(map: ReflectorMapView, eye: wp.vec3, target: wp.vec3) -> wp.vec3:
+    """Cube point below the foot of the bisector in whitened space (exact for two points at equal height on a sphere)."""
+    o = wp.cw_mul(eye, map.inv_extent)
+    v = wp.cw_mul(target, map.inv_extent)
+    a = wp.max(wp.length(o) - 1.0, 1.0e-3)
+    b = wp.max(wp.length(v) - 1.0, 1.0e-3)
+    t = b / (a + b)
+    w = t * o + (1.0 - t) * v
+    if max_abs(w) < 1.0e-6:
+        return project_to_cube(o)
+    return project_to_cube(w)
+
+
+@wp.func
+def measure(s: MapSample, x: wp.vec3, eye: wp.vec3, target: wp.vec3) -> SearchResult:
+    """The law of reflection at a sample; residual grows beyond any tangent where the normal part is not positive."""
+    r = SearchResult()
+    r.x = x
+    r.p = s.p
+    r.n = s.n
+    o = wp.normalize(eye - s.p)
+    v = wp.normalize(target - s.p)
+    w = o + v
+    r.cos_eye = wp.dot(s.n, o)
+    r.cos_target = wp.dot(s.n, v)
+    w_n = r.cos_eye + r.cos_target
+    w_t = wp.length(w - w_n * s.n)
+    if w_n > NORMAL_PART_MIN:
+        r.residual = w_t / w_n
+    else:
+        r.residual = 1.0e4 - w_n
+    return r
+
+
+@wp.func
+def newton_step(s: MapSample, eye: wp.vec3, target: wp.vec3) -> wp.vec3:
+    """Tangential displacement towards the zero of w_T / w_N (w = o + v unnormalised).
+
+    H = T^T [(I - o o^T)/d_O + (I - v v^T)/d_V] T + w_N S is the Hessian of the path length, S the shape operator from the
+    map's own derivatives, clamped to a convex body's; the residual's Jacobian adds the rank-one change of w_N.
+    """
+    to_eye = eye - s.p
+    to_target = target - s.p
+    d_o = wp.length(to_eye)
+    d_v = wp.length(to_target)
+    inv_o = 1.0 / wp.max(d_o, 1.0e-20)
+    inv_v = 1.0 / wp.max(d_v, 1.0e-20)
+    o = to_eye * inv_o
+    v = to_target * inv_v
+    n = s.n
+    # Orthonormal basis without branches: Duff et al. 2017, "Building an Orthonormal Basis, Revisited".
+    sign = wp.where(n[2] < 0.0, -1.0, 1.0)
+    f = -1.0 / (sign + n[2])
+    g0 = n[0] * n[1] * f
+    t1 = wp.vec3(1.0 + sign * n[0] * n[0] * f, sign * g0, -sign * n[0])
+    t2 = wp.vec3(g0, sign + n[1] * n[1] * f, -n[1])
+    o1 = wp.dot(t1, o)
+    o2 = wp.dot(t2, o)
+    v1 = wp.dot(t1, v)
+    v2 = wp.dot(t2, v)
+    n_o = wp.dot(n, o)
+    n_v = wp.dot(n, v)
+    w_n = n_o + n_v
+    # Shape operator S = JN JP^-1.
+    a11 = wp.dot(t1, s.p_u)
+    a12 = wp.dot(t1, s.p_v)
+    a21 = wp.dot(t2, s.p_u)
+    a22 = wp.dot(t2, s.p_v)
+    b11 = wp.dot(t1, s.n_u)
+    b12 = wp.dot(t1, s.n_v)
+    b21 = wp.dot(t2, s.n_u)
+    b22 = wp.dot(t2, s.n_v)
+    det_p = a11 * a22 - a12 * a21
+    s11 = float(0.0)
+    s12 = float(0.0)
+    s22 = float(0.0)
+    if wp.abs(det_p) > 1.0e-20:
+        inv_p = 1.0 / det_p
+        s11 = wp.max((b11 * a22 - b12 * a21) * inv_p, 0.0)
+        s22 = wp.max((b22 * a11 - b21 * a12) * inv_p, 0.0)
+        bound = wp.sqrt(s11 * s22)
+        s12 = wp.clamp(0.5 * ((b12 * a11 - b11 * a12) + (b21 * a22 - b22 * a21)) * inv_p, -bound, bound)
+    k = wp.max(w_n, 0.0)
+    h11 = (1.0 - o1 * o1) * inv_o + (1.0 - v1 * v1) * inv_v + k * s11
+    h22 = (1.0 - o2 * o2) * inv_o + (1.0 - v2 * v2) * inv_v + k * s22
+    h12 = -o1 * o2 * inv_o - v1 * v2 * inv_v + k * s12
+    g1 = o1 + v1
+    g2 = o2 + v2
+    det_h = h11 * h22 - h12 * h12
+    d1 = float(0.0)
+    d2 = float(0.0)
+    safe = bool(True)
+    if w_n > NORMAL_PART_MIN:
+        q1 = s11 * g1 + s12 * g2 + n_o * o1 * inv_o + n_v * v1 * inv_v
+        q2 = s12 * g1 + s22 * g2 + n_o * o2 * inv_o + n_v * v2 * inv_v
+        inv_w = 1.0 / w_n
+        j11 = h11 + g1 * q1 * inv_w
+        j12 = h12 + g1 * q2 * inv_w
+        j21 = h12 + g2 * q1 * inv_w
+        j22 = h22 + g2 * q2 * inv_w
+        det = j11 * j22 - j12 * j21
+        if det > SPD_SHARE * det_h and det > 0.0:
+            d1 = (j22 * g1 - j12 * g2) / det
+            d2 = (j11 * g2 - j21 * g1) / det
+            safe = False
+    if safe and det_h > 0.0:
+        d1 = (h22 * g1 - h12 * g2) / det_h
+        d2 = (h11 * g2 - h12 * g1) / det_h
+    return d1 * t1 + d2 * t2
+
+
+@wp.func
+def step_on_cube(map: ReflectorMapView, r: SearchResult, step: wp.vec3, shrink: float) -> wp.vec3:
+    """The cube point a tangential step leads to, capped so that it stays on its side of the body."""
+    whitened = wp.cw_mul(r.p, map.inv_extent)
+    move = wp.cw_mul(step, map.inv_extent)
+    cap = wp.min(1.0, STEP_CAP * wp.length(whitened) / wp.max(wp.length(move), 1.0e-30))
+    # From the cube point, not from the bilinear position, whose own direction is off by h^2.
+    return project_to_cube(r.x * max_abs(whitened) + move * (cap * shrink))
+
+
+@wp.func
+def coarse_seed(map: ReflectorMapView, eye: wp.vec3, target: wp.vec3) -> wp.vec3:
+    """The best of a coarse set of directions: the fallback of a search that ended far from a root."""
+    best = float(1.0e30)
+    seed = wp.vec3(1.0, 0.0, 0.0)
+    for k in range(6 * COARSE_NODES * COARSE_NODES):
+        face = k / (COARSE_NODES * COARSE_NODES)
+        u = (2.0 * float(k % COARSE_NODES) + 1.0) / float(COARSE_NODES) - 1.0
+        v = (2.0 * float((k / COARSE_NODES) % COARSE_NODES) + 1.0) / float(COARSE_NODES) - 1.0
+        sign = 1.0 - 2.0 * float(face % 2)
+        x = wp.vec3(sign, u, v)
+        if face >= 4:
+            x = wp.vec3(u, v, sign)
+        elif face >= 2:
+            x = wp.vec3(v, sign, u)
+        r = measure(sample_map(map, x), x, eye, target)
+        if r.residual < best and r.cos_eye > 0.0 and r.cos_target > 0.0:
+            best = r.residual
+            seed = x
+    return seed
+
+
+@wp.func
+def search_newton(
+    map: ReflectorMapView, eye: wp.vec3, target: wp.vec3, seed: wp.vec3, evaluations: int, tolerance: float
+) -> SearchResult:
+    """Reflection point of a visible target: Newton steps, each shortened until it lowers the residual.
+
+    A search that ends far from a root starts once more from the coarse seed. One loop over samples for both starts:
+    everything is inlined, and a second copy of the body would double the compile time.
+    """
+    best = SearchResult()
+    best.residual = 1.0e30
+    step = wp.vec3(0.0, 0.0, 0.0)
+    x = seed
+    shrink = float(1.0)
+    used = int(0)
+    attempt = int(0)
+    while used < 2 * evaluations:
+        sample = sample_map(map, x)
+        r = measure(sample, x, eye, target)
+        used += 1
+        if r.residual < best.residual:
+            best = r
+            step = newton_step(sample, eye, target)
+            shrink = 1.0
+        else:
+            shrink = shrink * RETRY_SHRINK
+        if best.residual <= tolerance:
+            break
+        if attempt == 0 and (used >= evaluations or shrink < SHRINK_MIN):
+            if best.residual <= ACCEPTED:
+                break
+            attempt = 1
+            used = evaluations
+            x = coarse_seed(map, eye, target)
+            # The coarse seed may be worse than where the first start got stuck, and must replace it all the same.
+            best.residual = 1.0e30
+        elif shrink < SHRINK_MIN:
+            break
+        else:
+            x = step_on_cube(map, best, step, shrink)
+    best.evaluations = used
+    return best
+
+
+@wp.func
+def bisector_field(map: ReflectorMapView, s: MapSample, x: wp.vec3, eye: wp.vec3, target: wp.vec3) -> wp.vec3:
+    """Projected bisector b: the push-forward of B - N to the cube face (paper, section 4.2)."""
+    w = wp.normalize(eye - s.p) + wp.normalize(target - s.p)
+    bisector = wp.normalize(w)
+    d = wp.cw_mul(bisector - s.n, map.inv_extent)
+    whitened = wp.cw_mul(s.p, map.inv_extent)
+    # x lies on face k: x_k = +-1 and (x_k d_k) is the change of the face's distance.
+    ax = wp.abs(x[0])
+    ay = wp.abs(x[1])
+    az = wp.abs(x[2])
+    along = float(0.0)
+    if ax >= ay and ax >= az:
+        along = d[0] * x[0]
+    elif ay >= az:
+        along = d[1] * x[1]
+    else:
+        along = d[2] * x[2]
+    return (d - along * x) * (wp.length(s.p) / wp.max(max_abs(whitened), 1.0e-20))
+
+
+@wp.func
+def search_midpoint(
+    map: ReflectorMapView, eye: wp.vec3, target: wp.vec3, seed: wp.vec3, iterations: int, tolerance: float
+) -> SearchResult:
+    """The paper's search: midpoint rule on the projected bisector with adaptive step (section 4.3), two samples a step.
+
+    The step is steered so that |b_m - b| / |b| tends to 1/2, where the midpoint rule contracts best, and accepted only
+    if the residual falls.
+    """
+    best = SearchResult()
+    best.residual = 1.0e30
+    middle = SearchResult()
+    b = wp.vec3(0.0, 0.0, 0.0)
+    b_m = wp.vec3(0.0, 0.0, 0.0)
+    h = float(MIDPOINT_STEP)
+    x = seed
+    # Samples in turn: the seed, then midpoint and full step of each iteration (one loop: see search_newton).
+    used = int(0)
+    while used <= 2 * iterations:
+        sample = sample_map(map, x)
+        r = measure(sample, x, eye, target)
+        field = bisector_field(map, sample, x, eye, target)
+        used += 1
+        if used == 1:
+            best = r
+            b = field
+        elif used % 2 == 0:
+            middle = r
+            b_m = field
+        else:
+            delta = wp.length(b_m - b) / wp.max(wp.length(b), 1.0e-20)
+            if r.residual < best.residual:
+                best = r
+                b = field
+                h = h * wp.clamp(MIDPOINT_DELTA / wp.max(delta, 1.0e-6), 0.5, 1.5)
+            elif middle.residual < best.residual:
+                best = middle
+                b = b_m
+            else:
+                h = 0.5 * h
+        if best.residual <= tolerance:
+            break
+        if used % 2 == 1:
+            h = wp.min(h, 1.0 / wp.max(wp.length(b), 1.0e-20))
+            x = project_to_cube(best.x + 0.5 * h * b)
+        else:
+            x = project_to_cube(best.x + h * b_m)
+    best.evaluations = used
+    return best
+
+
+@wp.struct
+class SearchSettings:
+    method: int  # SEARCH_MIDPOINT, else Newton
+    iterations: int
+    tolerance: float
+
+
+@wp.func
+def search(
+    map: ReflectorMapView, eye: wp.vec3, target: wp.vec3, seed: wp.vec3, settings: SearchSettings
+) -> SearchResult:
+    """Reflection point of a visible target by the chosen search."""
+    if settings.method == SEARCH_MIDPOINT:
+        return search_midpoint(map, eye, target, seed, settings.iterations, settings.tolerance)
+    return search_newton(map, eye, target, seed, settings.iterations, settings.tolerance)
+
+
+@wp.func
+def solve_vertex(
+    map: ReflectorMapView,
+    frame: SolveFrame,
+    camera: CameraView,
+    settings: SearchSettings,
+    target: wp.vec3,
+    warm_seed: wp.vec3,
+    i: int,
+    out_vertex: VertexView,
+):
+    """Full solution of one vertex into entry i."""
+    out_vertex.seed[i] = wp.vec3(0.0, 0.0, 0.0)
+    out_vertex.screen[i] = wp.vec4(0.0, 0.0, -1.0, 0.0)
+    if not is_visible(map, frame.eye, target):
+        out_vertex.status[i] = wp.uint8(HIDDEN)
+        return
+    seed = warm_seed
+    if max_abs(seed) == 0.0:
+        seed = first_guess(map, frame.eye, target)
+    r = search(map, frame.eye, target, seed, settings)
+    out_vertex.seed[i] = r.x
+    out_vertex.residual[i] = r.residual
+    if r.residual > ACCEPTED:
+        # So close behind the silhouette that the bilinear body and the gauge disagree: as good as hidden, and the
+        # boundary's bisection ends at the vertex itself, where virtual and real point coincide.
+        grazing = wp.min(r.cos_eye, r.cos_target) < GRAZING_COS
+        out_vertex.status[i] = wp.uint8(wp.where(grazing, HIDDEN, MAX_ITERATIONS))
+        return
+    out_vertex.status[i] = wp.uint8(CONVERGED)
+    out_vertex.reach[i] = edge_reach(frame, r.p, r.n, target, map.least_curvature)
+    q = virtual_vertex(frame, r.p, r.n, target)
+    out_vertex.screen[i] = project(camera, q)
+    if out_vertex.position.shape[0] > 0:
+        out_vertex.position[i] = q
+
+
+def default_tolerance(resolution: int) -> float:
+    """0.1 h^2 for texel size h, between the float32 floor and what a picture needs."""
+    h = 2.0 / (resolution - 1)
+    return min(max(0.1 * h * h, TOLERANCE_MIN), TOLERANCE_MAX)
+
+
+def search_settings(settings: Settings, resolution: int) -> SearchSettings:
+    """The device form of the search's settings, defaults filled in."""
+    result = SearchSettings()
+    midpoint = settings.search == "midpoint"
+    result.method = int(SEARCH_MIDPOINT) if midpoint else 0
+    result.iterations = settings.iterations or (MIDPOINT_ITERATIONS if midpoint else NEWTON_EVALUATIONS)
+    result.tolerance = settings.tolerance or default_tolerance(resolution)
+    return result
