@@ -67,6 +67,7 @@ class OwnBody:
     first_triangle: int
     triangle_count: int  # 0: no body
     convex: int  # a ray that leaves it cannot meet it again
+    alone: int  # 1: the structure holds these triangles and no others
 
 
 @wp.func
@@ -185,6 +186,8 @@ def trace_ray(
             d = moved_direction(d)
         else:
             triangle = query.face
+            if body.alone != 0:
+                triangle += body.first_triangle
             t = t0 + query.t
             step_over = triangle == facet
             if triangle >= body.first_triangle and triangle < body.first_triangle + body.triangle_count:
@@ -320,6 +323,26 @@ def retry_pixels_kernel(
 
 
 @wp.kernel
+def own_obstacles_kernel(
+    first: int,
+    mesh_id: wp.uint64,
+    scene: SceneView,
+    # Mirror pixels:
+    facets: wp.array(dtype=int),
+    pixel: wp.array(dtype=int),
+    point: wp.array(dtype=wp.vec3),
+    normal: wp.array(dtype=wp.vec3),
+    direction: wp.array(dtype=wp.vec3),
+    body: OwnBody,
+    out_blocked: wp.array(dtype=wp.uint8),
+):
+    """One thread per mirror pixel."""
+    i = first + wp.tid()
+    hit = trace_ray(mesh_id, scene, point[i], direction[i], normal[i], facets[pixel[i]], body, 0)
+    out_blocked[i] = wp.uint8(wp.where(hit.status == SKY, 0, 1))
+
+
+@wp.kernel
 def trace_shadows_kernel(
     first: int,
     mesh_id: wp.uint64,
@@ -347,19 +370,23 @@ def trace_shadows_kernel(
 
 
 class Tracer:
-    """Owner of the triangle BVH of a scene.
+    """Owner of the triangle BVH of a scene, or of one of its parts alone.
 
     Attributes:
         id: Handle for `trace_ray`; valid while this object lives. 0 for a scene without triangles, which has
             no structure and must not be queried.
     """
 
-    def __init__(self, scene: Scene):
+    def __init__(self, scene: Scene, part: int | None = None):
         self.scene = scene
         self._mesh = None
-        if scene.triangle_count:
+        triangles = scene.host_triangles
+        if part is not None:
+            own = scene.parts[part]
+            triangles = triangles[own.first_triangle : own.first_triangle + own.triangle_count]
+        if len(triangles):
             # The traversal wants flat indices. Copied: the structure's memory must not move.
-            indices = wp.array(scene.host_triangles.reshape(-1), dtype=wp.int32, device=scene.device)
+            indices = wp.array(triangles.reshape(-1), dtype=wp.int32, device=scene.device)
             constructor = "lbvh" if scene.device.is_cuda else "sah"
             self._mesh = wp.Mesh(scene.view.points, indices, bvh_constructor=constructor)
 
@@ -458,6 +485,28 @@ def trace_pixels(
     before = wp.clone(layer.status)
     launch.launch(retry_pixels_kernel, count, [*rays, before, *outputs], scene.device, threads)
     return count
+
+
+def own_obstacles(scene: Scene, gbuffer: GBuffer, pixels: MirrorPixels, part: int, threads: int = 0) -> wp.array:
+    """Which reflected rays meet the mirror's own body again (or are not settled).
+
+    Args:
+        scene: Its part's own BVH is built if this is the first use.
+        gbuffer: Names the facet each pixel starts on.
+        pixels: The mirror pixels of a reflector.
+        part: The mirror itself, index into `scene.parts`.
+        threads: CPU threads; 0: one per core.
+
+    Returns:
+        uint8 [pixels.count], 1 where the own body is in the way.
+    """
+    blocked = wp.zeros(pixels.count, dtype=wp.uint8, device=scene.device)
+    body = body_of(scene, part, convex=False)
+    body.alone = 1
+    rays = [gbuffer.triangle, pixels.pixel, pixels.point, pixels.normal, pixels.direction]
+    inputs = [wp.uint64(scene.part_tracer(part).id), scene.view, *rays, body, blocked]
+    launch.launch(own_obstacles_kernel, pixels.count, inputs, scene.device, threads, split_min=TRACE_SPLIT_MIN)
+    return blocked
 
 
 def trace_shadows(

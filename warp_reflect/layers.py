@@ -205,6 +205,36 @@ class MirrorPixels:
     def count(self) -> int:
         return len(self.pixel)
 
+    def select(self, chosen: np.ndarray, reflector: int, width: int) -> MirrorPixels:
+        """Some of the pixels under another id.
+
+        Args:
+            chosen: Ascending indices into the pixels.
+            reflector: The id they get.
+            width: Of the image. [pixels]
+        """
+        pixel = self.pixel.numpy()[chosen]
+        device = self.pixel.device
+        vectors = [
+            wp.array(array.numpy()[chosen], dtype=wp.vec3, device=device)
+            for array in (self.point, self.normal, self.direction)
+        ]
+        numbers = wp.array(pixel, dtype=int, device=device)
+        return MirrorPixels(reflector, numbers, *vectors, pixel_bounds(pixel, width))
+
+
+def pixel_bounds(pixel: np.ndarray, width: int) -> tuple[int, int, int, int]:
+    """Half-open bounds (x0, y0, x1, y1) of ascending pixel numbers; all 0 if there are none."""
+    if not len(pixel):
+        return (0, 0, 0, 0)
+    column = pixel % width
+    return (
+        int(column.min()),
+        int(pixel[0]) // width,
+        int(column.max()) + 1,
+        int(pixel[-1]) // width + 1,
+    )
+
 
 @dataclass(frozen=True)
 class Reflector:

@@ -267,6 +267,7 @@ class Scene:
         self.notes = list(data.notes)
         self._reload = reload
         self._bodies: dict[int, Body] = {}
+        self._part_tracers: dict = {}
         self._pyramids: dict = {}
         if any(material.textures for material in data.materials):
             from warp_reflect import textures
@@ -341,6 +342,14 @@ class Scene:
         from warp_reflect import bvh
 
         return bvh.Tracer(self)
+
+    def part_tracer(self, part: int):
+        """The owner of the ray acceleration structure of one part alone (`bvh.Tracer`), built at first use."""
+        from warp_reflect import bvh
+
+        if part not in self._part_tracers:
+            self._part_tracers[part] = bvh.Tracer(self, part)
+        return self._part_tracers[part]
 
     @cached_property
     def lights(self):
@@ -434,13 +443,15 @@ class Scene:
         self.host_normals = _stack(normals, (0, 3), np.float32)
         self.host_normal_index = _stack(normal_index, (0, 3), np.int32)
         view = SceneView()
-        view.points = wp.array(self.host_points, dtype=wp.vec3, device=self.device)
-        view.triangles = wp.array(self.host_triangles, dtype=wp.vec3i, device=self.device)
-        view.normals = wp.array(self.host_normals, dtype=wp.vec3, device=self.device)
-        view.normal_index = wp.array(self.host_normal_index, dtype=wp.vec3i, device=self.device)
-        view.colors = wp.array(_stack(colors, (0, 3), np.float32), dtype=wp.vec3, device=self.device)
-        view.color_index = wp.array(_stack(color_index, (0, 3), np.int32), dtype=wp.vec3i, device=self.device)
-        view.triangle_patch = wp.array(self.host_triangle_patch, dtype=int, device=self.device)
+        # On the CPU the device arrays are the host's own.
+        view.points = wp.array(self.host_points, dtype=wp.vec3, device=self.device, copy=False)
+        view.triangles = wp.array(self.host_triangles, dtype=wp.vec3i, device=self.device, copy=False)
+        view.normals = wp.array(self.host_normals, dtype=wp.vec3, device=self.device, copy=False)
+        view.normal_index = wp.array(self.host_normal_index, dtype=wp.vec3i, device=self.device, copy=False)
+        view.colors = wp.array(_stack(colors, (0, 3), np.float32), dtype=wp.vec3, device=self.device, copy=False)
+        color_index = _stack(color_index, (0, 3), np.int32)
+        view.color_index = wp.array(color_index, dtype=wp.vec3i, device=self.device, copy=False)
+        view.triangle_patch = wp.array(self.host_triangle_patch, dtype=int, device=self.device, copy=False)
         view.patches = wp.array(patches, dtype=PatchView, device=self.device)
         view.materials = wp.array([material_view(m) for m in data.materials], dtype=MaterialView, device=self.device)
         self.view = view

@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 
 from warp_reflect import launch
-from warp_reflect.layers import CameraView, GBuffer, MirrorPixels, eye_ray_direction, eye_ray_origin
+from warp_reflect.layers import CameraView, GBuffer, MirrorPixels, eye_ray_direction, eye_ray_origin, pixel_bounds
 from warp_reflect.scene import SHAPE_PLANE, SHAPE_QUADRIC, Scene, SceneView
 from warp_reflect.shapes import clamp_weights, facet_normal, intersect_triangle, max_abs, unit
 
@@ -282,7 +282,7 @@ def mirror_pixels(
             point=wp.empty(n, dtype=wp.vec3, device=device),
             normal=wp.empty(n, dtype=wp.vec3, device=device),
             direction=wp.empty(n, dtype=wp.vec3, device=device),
-            box=_bounds(pixel, width),
+            box=pixel_bounds(pixel, width),
         )
         launch.launch(
             mirror_pixels_kernel,
@@ -312,19 +312,6 @@ def _pixels_by_reflector(reflector_id: np.ndarray, parts: Mapping[int, int]) -> 
         return dict.fromkeys(parts, pixel)
     ids = reflector_id[pixel]
     return {reflector: pixel[ids == reflector] for reflector in parts}
-
-
-def _bounds(pixel: np.ndarray, width: int) -> tuple[int, int, int, int]:
-    """Half-open bounds (x0, y0, x1, y1) of ascending pixel numbers; all 0 if there are none."""
-    if not len(pixel):
-        return (0, 0, 0, 0)
-    column = pixel % width
-    return (
-        int(column.min()),
-        int(pixel[0]) // width,
-        int(column.max()) + 1,
-        int(pixel[-1]) // width + 1,
-    )
 
 
 @wp.kernel

@@ -293,8 +293,14 @@ def reflect(
             )
         layer.statistics.update(candidate=pixels.count)
     else:
+        with timer("own_body"):
+            blocked = wp.zeros(0, dtype=wp.uint8, device=scene.device)
+            if not reflector.convex:
+                blocked = bvh.own_obstacles(scene, gbuffer, pixels, reflector.part, settings.threads)
         with timer("refine"):
-            doubtful = refine.settle(scene, gbuffer, pixels, target, mesh, layer, settings, trust_sky=failed == 0)
+            doubtful = refine.settle(
+                scene, gbuffer, pixels, target, mesh, layer, blocked, settings, trust_sky=failed == 0
+            )
         with timer("trace"):
             bvh.trace_pixels(
                 scene, gbuffer, pixels, layer, reflector.part, reflector.convex, doubtful, settings.threads

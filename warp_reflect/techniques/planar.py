@@ -8,7 +8,7 @@ mirror's plane, where the virtual and the real point coincide; depth keeps its r
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import warp as wp
@@ -103,7 +103,8 @@ def prepare(scene: Scene, reflector: Reflector, settings: Settings) -> Prepared:
     matrix = np.eye(4)
     matrix[:3, :3] = np.stack([x, np.cross(normal, x), normal]) / size
     matrix[:3, 3] = -matrix[:3, :3] @ point
-    return Prepared(reflector, matrix)
+    # A plane never sees itself, closed or not.
+    return Prepared(replace(reflector, convex=True), matrix)
 
 
 def reflect(

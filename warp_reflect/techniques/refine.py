@@ -137,6 +137,7 @@ def settle_kernel(
     pixel: wp.array(dtype=int),
     point: wp.array(dtype=wp.vec3),
     direction: wp.array(dtype=wp.vec3),
+    blocked: wp.array(dtype=wp.uint8),
     # Settings:
     hop_count: int,
     trust_sky: int,
@@ -151,6 +152,9 @@ def settle_kernel(
     """One thread per mirror pixel."""
     i = first + wp.tid()
     out_settled[i] = wp.uint8(DOUBT)
+    if blocked.shape[0] > 0:
+        if int(blocked[i]) != 0:
+            return
     y = pixel[i] / target.mask_width
     x = pixel[i] - y * target.mask_width
     cell = (y - target.y0) * (target.x1 - target.x0) + x - target.x0
@@ -217,6 +221,7 @@ def settle(
     target: raster.Target,
     mesh: VirtualMesh,
     layer: ReflectionLayer,
+    blocked: wp.array,
     settings: Settings,
     trust_sky: bool,
 ) -> wp.array:
@@ -226,6 +231,7 @@ def settle(
         target: The reflector's virtual z-buffer over `pixels.box`, ids are virtual triangles.
         mesh: What was drawn.
         layer: Receives triangle, u, v, distance, status of the settled pixels, and their counts.
+        blocked: uint8 [pixels.count], 1 where the mirror's own body (which is not drawn) is in the way; length 0: nowhere.
         trust_sky: No virtual triangle was dropped: an empty neighbourhood is sky.
 
     Returns:
@@ -245,6 +251,7 @@ def settle(
             pixels.pixel,
             pixels.point,
             pixels.direction,
+            blocked,
         ]
         + [settings.walk_hops, int(trust_sky)]
         + [layer.triangle, layer.u, layer.v, layer.distance, layer.status, settled],
