@@ -197,7 +197,7 @@ def test_instance_budget_is_kept(tmp_path):
 def rich_stage(path):
     stage = samples.new_stage(path)
     cube = samples.add_cube_mesh(stage, "/Cube")
-    cube.CreateDisplayColorPrimvar("vertex").Set([Gf.Vec3f(k, 0, 0) for k in range(8)])
+    cube.CreateDisplayColorPrimvar("uniform").Set([Gf.Vec3f(k, 0, 0) for k in range(6)])
     UsdGeom.Capsule.Define(stage, "/Capsule").AddScaleOp().Set(Gf.Vec3f(1, 2, 3))
     samples.bind(stage.GetPrimAtPath("/Capsule"), samples.add_material(stage, "/M", metallic=1.0))
     UsdGeom.Camera.Define(stage, "/Camera")

@@ -303,4 +303,4 @@ def test_vertex_and_face_varying_values_reach_refined_corners(stage):
     primvar.Set([Gf.Vec3f(*p) for p in samples.CUBE_POINTS])
     drawn = read_stage(samples.saved(stage), complexity="medium").meshes[0]
     # Refined by the same rules as the points: still equal to them.
-    np.testing.assert_allclose(drawn.colors[drawn.color_index], drawn.points[drawn.triangles], atol=1e-6)
+    np.testing.assert_allclose(drawn.colors, drawn.points, atol=1e-6)

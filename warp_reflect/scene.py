@@ -391,7 +391,8 @@ class Scene:
             flip = np.linalg.det(linear) < 0.0
             order = [0, 2, 1] if flip else [0, 1, 2]
             points.append((mesh.points.astype(np.float64) @ linear.T + scene_from_object[:3, 3]).astype(np.float32))
-            triangles.append(mesh.triangles[:, order] + np.int32(first_vertex))
+            triangles.append(np.take(mesh.triangles, order, axis=1))
+            triangles[-1] += np.int32(first_vertex)
             if mesh.normals is None:
                 normal_index.append(np.full((count, 3), -1, np.int32))
             else:
@@ -399,7 +400,8 @@ class Scene:
                 transformed /= np.maximum(np.linalg.norm(transformed, axis=1, keepdims=True), 1e-300)
                 normals.append(transformed.astype(np.float32))
                 index = mesh.triangles if mesh.normal_index is None else mesh.normal_index
-                normal_index.append(index[:, order] + np.int32(first_normal))
+                normal_index.append(np.take(index, order, axis=1))
+                normal_index[-1] += np.int32(first_normal)
                 first_normal += len(mesh.normals)
             if any_color:
                 if mesh.colors is None:
@@ -407,7 +409,8 @@ class Scene:
                 else:
                     colors.append(mesh.colors.astype(np.float32))
                     index = mesh.triangles if mesh.color_index is None else mesh.color_index
-                    color_index.append(index[:, order] + np.int32(first_color))
+                    color_index.append(np.take(index, order, axis=1))
+                    color_index[-1] += np.int32(first_color)
                     first_color += len(mesh.colors)
             object_from_scene = np.linalg.inv(scene_from_object)
             for k, part in enumerate(mesh.parts or [Part(0, count)]):
@@ -458,7 +461,9 @@ class Scene:
 
 
 def _stack(arrays: list, empty: tuple, dtype) -> np.ndarray:
-    return np.concatenate(arrays).astype(dtype, copy=False) if arrays else np.zeros(empty, dtype)
+    if not arrays:
+        return np.zeros(empty, dtype)
+    return (arrays[0] if len(arrays) == 1 else np.concatenate(arrays)).astype(dtype, copy=False)
 
 
 def _patch_view(patch, first_triangle, part, prim, material, mesh, object_from_scene) -> PatchView:

@@ -227,7 +227,9 @@ def usable(placed: list[InstanceData], intake: Intake) -> list[InstanceData]:
 
 def used_box(mesh: MeshData) -> Box:
     """Bounds of the points that triangles use, float64 [3] each."""
-    used = mesh.points[mesh.triangles.reshape(-1)]
+    is_used = np.zeros(len(mesh.points), bool)
+    is_used[mesh.triangles.reshape(-1)] = True
+    used = mesh.points[is_used]
     return used.min(axis=0).astype(np.float64), used.max(axis=0).astype(np.float64)
 
 

@@ -19,6 +19,7 @@ from warp_reflect.stage.triangulate import triangulate
 DEGENERATE_AREA = 1.0e-12
 SMOOTH_SCHEMES = ("catmullClark", "loop")
 REFINED_FACES_MAX = 4_000_000  # of one mesh; above it the level is lowered (about 1 GB while refining)
+BLOCK = 1 << 15  # faces or triangles worked on at a time: their float64 intermediates stay in the cache
 
 
 def read_gprim(prim, intake: Intake, level: int) -> MeshData:
@@ -74,8 +75,8 @@ class _Surface:
 
     Attributes:
         points: float64 [point_count, 3].
-        counts, indices: Faces, int64.
-        source: Face of the authored mesh each face belongs to, int64 [face_count].
+        counts, indices: Faces, int32 or int64.
+        source: Face of the authored mesh each face belongs to, int [face_count].
         drawn: bool [face_count].
         attributes: What follows the corners, by name: "normals", "colors", "uvs".
     """
@@ -116,17 +117,13 @@ def read_mesh(
     elif scheme in SMOOTH_SCHEMES and not len(mesh.GetCreaseLengthsAttr().Get(intake.time) or ()):
         surface.attributes["normals"] = _point_normals(surface)
 
-    starts = np.cumsum(surface.counts) - surface.counts
-    kept = np.flatnonzero(surface.drawn)
-    corner_of_kept = _ranges(starts[kept], surface.counts[kept])
-    corners, face, crossing = triangulate(surface.counts[kept], surface.indices[corner_of_kept], surface.points)
-    corners, face = corner_of_kept[corners], kept[face]
+    corners, face, crossing = _triangles(surface)
     triangles = surface.indices[corners]
     solid = _has_area(surface.points, triangles)
     if not solid.all():
         intake.note(path, f"faceVertexIndices: {np.sum(~solid)} triangles without area dropped")
         corners, face, triangles = corners[solid], face[solid], triangles[solid]
-    crossing = np.intersect1d(kept[crossing], face)
+    crossing = crossing[np.isin(crossing, face)]
     if len(crossing):
         first = surface.source[crossing[0]]
         intake.note(path, f"faceVertexIndices: face {first} crosses itself, as do {len(crossing) - 1} more")
@@ -134,9 +131,12 @@ def read_mesh(
         raise BadPrim("points: got no face with an area, expected one")
 
     part_of_face, subsets = _material_subsets(mesh, face_count, intake)
-    part = part_of_face[surface.source[face]]
-    order = np.argsort(part, kind="stable")
-    corners, face, triangles = corners[order], face[order], triangles[order]
+    sizes = np.array([len(triangles)])
+    if len(subsets) > 1:
+        part = part_of_face[surface.source[face]]
+        order = np.argsort(part, kind="stable")
+        corners, face, triangles = corners[order], face[order], triangles[order]
+        sizes = np.bincount(part, minlength=len(subsets))
     if mesh.GetOrientationAttr().Get(intake.time) == "leftHanded":
         corners, triangles = corners[:, [0, 2, 1]], triangles[:, [0, 2, 1]]
         if scheme in SMOOTH_SCHEMES and "normals" in surface.attributes:
@@ -144,7 +144,6 @@ def read_mesh(
 
     result = MeshData(surface.points.astype(np.float32), triangles.astype(np.int32))
     result.double_sided = bool(mesh.GetDoubleSidedAttr().Get(intake.time))
-    sizes = np.bincount(part, minlength=len(subsets))
     firsts = np.cumsum(sizes) - sizes
     named = [
         (Part(int(f), int(n), s.GetName() if s else ""), s) for f, n, s in zip(firsts, sizes, subsets, strict=True) if n
@@ -155,7 +154,8 @@ def read_mesh(
         for name, attribute in surface.attributes.items()
     }
     if "normals" in placed:
-        result.normals, result.normal_index = _unit_normals(*placed["normals"], surface.points, triangles, path, intake)
+        values, result.normal_index = placed["normals"]
+        result.normals = _unit_normals(values, result.normal_index, surface.points, triangles, path, intake)
     if "colors" in placed:
         result.colors, result.color_index = placed["colors"][0].astype(np.float32), placed["colors"][1]
     if "uvs" in placed:
@@ -163,19 +163,41 @@ def read_mesh(
     return result, [subset for _, subset in named]
 
 
+def _triangles(surface: _Surface) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(corners int32 [triangle_count, 3], face int32 [triangle_count], crossing faces) of the faces that are drawn."""
+    if surface.drawn.all():
+        return triangulate(surface.counts, surface.indices, surface.points)
+    starts = np.cumsum(surface.counts) - surface.counts
+    kept = np.flatnonzero(surface.drawn)
+    corner_of_kept = _ranges(starts[kept], surface.counts[kept]).astype(np.int32)
+    corners, face, crossing = triangulate(surface.counts[kept], surface.indices[corner_of_kept], surface.points)
+    return corner_of_kept[corners], kept[face].astype(np.int32), kept[crossing]
+
+
 def _point_normals(surface: _Surface) -> CornerAttribute:
     """Normals of a cage drawn as it is: the sum of the area vectors of the faces at each point."""
-    starts = np.cumsum(surface.counts) - surface.counts
-    face_of = np.repeat(np.arange(len(surface.counts)), surface.counts)
-    within = np.arange(len(surface.indices)) - starts[face_of]
-    size = surface.counts[face_of]
-    ahead = surface.indices[starts[face_of] + (within + 1) % size]
-    behind = surface.indices[starts[face_of] + (within - 1) % size]
-    here = surface.points[surface.indices]
-    turn = np.cross(surface.points[ahead] - here, surface.points[behind] - here)
-    turn[~surface.drawn[face_of]] = 0.0
-    columns = [np.bincount(surface.indices, turn[:, k], len(surface.points)) for k in range(3)]
-    return CornerAttribute(np.stack(columns, axis=1), None, "vertex")
+    total = np.zeros((3, len(surface.points)))
+    corner = 0
+    for first in range(0, len(surface.counts), BLOCK):
+        counts = surface.counts[first : first + BLOCK]
+        indices = surface.indices[corner : corner + int(counts.sum())]
+        drawn = surface.drawn[first : first + BLOCK]
+        corner += len(indices)
+        if (counts == 3).all():
+            triangles = indices.reshape(-1, 3)[drawn]
+            a, b, c = (surface.points[triangles[:, k]] for k in range(3))
+            at, turn = triangles.reshape(-1), np.repeat(np.cross(b - a, c - a), 3, axis=0)
+        else:
+            starts = np.cumsum(counts) - counts
+            face_of = np.repeat(np.arange(len(counts)), counts)
+            within, size = np.arange(len(indices)) - starts[face_of], counts[face_of]
+            here = surface.points[indices]
+            ahead = surface.points[indices[starts[face_of] + (within + 1) % size]]
+            behind = surface.points[indices[starts[face_of] + (within - 1) % size]]
+            at, turn = indices[drawn[face_of]], np.cross(ahead - here, behind - here)[drawn[face_of]]
+        for k in range(3):
+            np.add.at(total[k], at, turn[:, k])
+    return CornerAttribute(total.T, None, "vertex")
 
 
 def subdivision_scheme(prim, intake: Intake) -> str:
@@ -233,13 +255,13 @@ def _authored(mesh: UsdGeom.Mesh, intake: Intake, uv_name: str, color_name: str)
                 path,
                 f"{label}: got {count} values, expected {expected} for {attribute.interpolation}; not used",
             )
-    return _Surface(points, counts, indices, np.arange(face_count), drawn, attributes)
+    return _Surface(points, counts, indices, np.arange(face_count, dtype=np.int32), drawn, attributes)
 
 
 def _refined(mesh: UsdGeom.Mesh, surface: _Surface, scheme: str, level: int, intake: Intake) -> _Surface:
     """The surface subdivided onto its limit."""
     path = mesh.GetPath()
-    counts, indices, attributes = surface.counts, surface.indices, surface.attributes
+    counts, indices, attributes = surface.counts.astype(np.int64), surface.indices, surface.attributes
     # A corner that repeats the one before it adds no edge: without this it would count as a border.
     starts = np.cumsum(counts) - counts
     face_of = np.repeat(np.arange(len(counts)), counts)
@@ -264,7 +286,7 @@ def _refined(mesh: UsdGeom.Mesh, surface: _Surface, scheme: str, level: int, int
     boundary = mesh.GetInterpolateBoundaryAttr().Get(intake.time)
     cage = Cage(
         left[faces],
-        indices[corners],
+        indices[corners].astype(np.int64),
         boundary if boundary in BOUNDARY_RULES else BOUNDARY_RULES[-1],
         creases,
         sharpness,
@@ -358,8 +380,10 @@ def _sharp_points(mesh: UsdGeom.Mesh, point_count: int, intake: Intake) -> tuple
     return indices, values
 
 
-def _corner_index(attribute: CornerAttribute, corners, face, triangles) -> np.ndarray:
-    """Index into the attribute's values per triangle corner, int32 [triangle_count, 3]."""
+def _corner_index(attribute: CornerAttribute, corners, face, triangles) -> np.ndarray | None:
+    """Index into the attribute's values per triangle corner, int32 [triangle_count, 3]; None: the triangles."""
+    if attribute.interpolation in ("vertex", "varying") and attribute.index is None:
+        return None
     if attribute.interpolation == "constant":
         index = np.zeros_like(triangles)
     elif attribute.interpolation == "uniform":
@@ -370,14 +394,14 @@ def _corner_index(attribute: CornerAttribute, corners, face, triangles) -> np.nd
 
 
 def _topology(mesh: UsdGeom.Mesh, intake: Intake) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Validated (points float64 [n, 3], counts int64, indices int64).
+    """Validated (points float64 [n, 3], counts, indices: int32 where authored so, else int64).
 
     UsdGeomMesh.ValidateTopology accepts negative counts, sums that wrap and points that are not finite: not
     used.
     """
     points = floats(mesh.GetPointsAttr(), intake.time, 3)
-    counts = integers(mesh.GetFaceVertexCountsAttr(), intake.time)
-    indices = integers(mesh.GetFaceVertexIndicesAttr(), intake.time)
+    counts = integers(mesh.GetFaceVertexCountsAttr(), intake.time, np.int32)
+    indices = integers(mesh.GetFaceVertexIndicesAttr(), intake.time, np.int32)
     for name, array in (("points", points), ("faceVertexCounts", counts), ("faceVertexIndices", indices)):
         if array is None or not len(array):
             raise BadPrim(f"{name}: got {'no value' if array is None else 'an empty array'}, expected a mesh")
@@ -391,9 +415,8 @@ def _topology(mesh: UsdGeom.Mesh, intake: Intake) -> tuple[np.ndarray, np.ndarra
         raise BadPrim(
             f"faceVertexIndices: got {len(indices)} values, expected {counts.sum()}, the sum of faceVertexCounts"
         )
-    wrong = (indices < 0) | (indices >= len(points))
-    if wrong.any():
-        first = int(np.argmax(wrong))
+    if indices.min() < 0 or indices.max() >= len(points):
+        first = int(np.argmax((indices < 0) | (indices >= len(points))))
         raise BadPrim(f"faceVertexIndices[{first}]: got {indices[first]}, expected 0 to {len(points) - 1}")
     fine = np.isfinite(points).all(axis=1) & (np.abs(points) <= COORDINATE_MAX).all(axis=1)
     if not fine.all():
@@ -428,10 +451,15 @@ def _ranges(starts: np.ndarray, counts: np.ndarray) -> np.ndarray:
 
 
 def _has_area(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    a, b, c = (points[triangles[:, k]] for k in range(3))
-    first, second = b - a, c - a
-    longest = np.maximum(np.maximum((first**2).sum(1), (second**2).sum(1)), ((c - b) ** 2).sum(1))
-    return np.linalg.norm(np.cross(first, second), axis=1) > DEGENERATE_AREA * longest
+    result = np.empty(len(triangles), bool)
+    for first in range(0, len(triangles), BLOCK):
+        a, b, c = (points[triangles[first : first + BLOCK, k]] for k in range(3))
+        sides = b - a, c - a, c - b
+        longest = np.maximum.reduce([np.einsum("ij,ij->i", side, side) for side in sides])
+        turn = np.cross(sides[0], sides[1])
+        area = np.sqrt(np.einsum("ij,ij->i", turn, turn))
+        result[first : first + BLOCK] = area > DEGENERATE_AREA * longest
+    return result
 
 
 def _material_subsets(mesh: UsdGeom.Mesh, face_count: int, intake: Intake) -> tuple[np.ndarray, list]:
@@ -496,21 +524,23 @@ def _normals(mesh: UsdGeom.Mesh, intake: Intake) -> tuple[CornerAttribute | None
     return CornerAttribute(values, None, interpolation), "normals"
 
 
-def _unit_normals(values, index, points, triangles, path, intake: Intake) -> tuple[np.ndarray, np.ndarray]:
+def _unit_normals(values, index, points, triangles, path, intake: Intake) -> np.ndarray:
     """Unit float32 normals; what is zero or not finite becomes the normal of a face that uses it."""
     largest = np.abs(values).max(axis=1)
     good = np.isfinite(largest) & (largest > 0.0)
-    unit = np.where(good[:, None], values, 1.0) / np.where(good, largest, 1.0)[:, None]
-    if not good[index].all():
-        first = int(np.argmin(good))
-        intake.note(
-            path,
-            f"normals[{first}]: got {tuple(values[first].tolist())}; {int(np.sum(~good))} replaced by face normals",
-        )
-        a, b, c = (points[triangles[:, k]] for k in range(3))
-        facet = np.cross(b - a, c - a)
-        facet /= np.linalg.norm(facet, axis=1, keepdims=True)
+    if good.all():
+        unit = values / largest[:, None]
+    else:
+        unit = np.where(good[:, None], values, 1.0) / np.where(good, largest, 1.0)[:, None]
+        index = triangles if index is None else index
         row, corner = np.nonzero(~good[index])
-        unit[index[row, corner]] = facet[row]
-    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
-    return unit.astype(np.float32), index
+        if len(row):
+            first = int(np.argmin(good))
+            intake.note(
+                path,
+                f"normals[{first}]: got {tuple(values[first].tolist())}; {int(np.sum(~good))} replaced by face normals",
+            )
+            a, b, c = (points[triangles[row, k]] for k in range(3))
+            unit[index[row, corner]] = np.cross(b - a, c - a)
+    unit /= np.sqrt(np.einsum("ij,ij->i", unit, unit))[:, None]
+    return unit.astype(np.float32)

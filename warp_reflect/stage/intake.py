@@ -82,8 +82,8 @@ def floats(attribute: Usd.Attribute, time: Usd.TimeCode, width: int) -> np.ndarr
     return array.astype(np.float64).reshape((-1,) if width == 1 else (-1, width))
 
 
-def integers(attribute: Usd.Attribute, time: Usd.TimeCode) -> np.ndarray | None:
-    """An int array attribute as int64 [n]; None where there is no value.
+def integers(attribute: Usd.Attribute, time: Usd.TimeCode, dtype: type = np.int64) -> np.ndarray | None:
+    """An int array attribute as int64 [n], or as `dtype` where that holds its type; None where there is no value.
 
     Raises:
         BadPrim: the value is of another type.
@@ -93,10 +93,10 @@ def integers(attribute: Usd.Attribute, time: Usd.TimeCode) -> np.ndarray | None:
         return None
     array = np.array(value)
     if array.size == 0 and array.dtype.kind in "fiu":
-        return np.zeros(0, np.int64)
+        return np.zeros(0, dtype)
     if array.dtype.kind not in "iu" or array.ndim != 1:
         raise BadPrim(f"{attribute.GetName()}: got {type(value).__name__}, expected int[]")
-    return array.astype(np.int64)
+    return array.astype(dtype if np.can_cast(array.dtype, dtype) else np.int64, copy=False)
 
 
 def number(attribute: Usd.Attribute, time: Usd.TimeCode, low: float = -np.inf, open_low: bool = False) -> float:

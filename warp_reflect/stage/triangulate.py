@@ -16,6 +16,7 @@ import numpy as np
 STRAIGHT_SINE = 1.0e-6
 # Corners that are tested faster one by one than by a call of NumPy.
 SCALAR_MAX = 12
+BLOCK = 1 << 14  # faces cut at a time: their float64 intermediates stay in the cache
 
 
 def triangulate(
@@ -36,44 +37,59 @@ def triangulate(
         (corners int32 [triangle_count, 3] into `indices`, face int32 [triangle_count], crossing int [n]: the
         faces whose outline crosses itself or has no area in its own plane). Triangles are in face order.
     """
-    counts = np.asarray(counts, np.int64)
-    starts = np.concatenate([[0], np.cumsum(counts)])[:-1]
+    counts = np.asarray(counts)
+    if (counts == 3).all():
+        corners = np.arange(3 * len(counts), dtype=np.int32).reshape(-1, 3)
+        return corners, np.arange(len(counts), dtype=np.int32), np.zeros(0, np.int64)
+    starts = (np.cumsum(counts) - counts).astype(np.int32)
     corner_sets, face_sets, crossing = [], [], []
-    for size in np.unique(counts):
-        faces = np.flatnonzero(counts == size)
-        corners = starts[faces][:, None] + np.arange(size)
-        if size == 3:
-            corner_sets.append(corners)
-            face_sets.append(faces)
-            continue
-        outline = points[indices[corners]].astype(np.float64)
-        fan = _fan(int(size))
-        good = _fan_is_inside(outline, fan)
-        if size == 4:
-            other = np.array([[0, 1, 3], [1, 2, 3]])
-            turned = ~good & _fan_is_inside(outline, other)
-            corner_sets.append(corners[turned][:, other].reshape(-1, 3))
-            face_sets.append(np.repeat(faces[turned], 2))
-            # A quad without an inside diagonal is degenerate or a bow tie: both diagonals are equally wrong.
-            crossing.extend(faces[~good & ~turned])
-            good = ~turned
-        corner_sets.append(corners[good][:, fan].reshape(-1, 3))
-        face_sets.append(np.repeat(faces[good], size - 2))
-        for row in np.flatnonzero(~good) if size > 4 else ():
-            local, clean = clip_ears(_flatten(outline[row]))
-            corner_sets.append(corners[row][local])
-            face_sets.append(np.full(len(local), faces[row]))
-            if not clean:
-                crossing.append(faces[row])
+    for size in np.flatnonzero(np.bincount(counts)).tolist():
+        of_size = np.flatnonzero(counts == size).astype(np.int32)
+        for first in range(0, len(of_size), BLOCK):
+            faces = of_size[first : first + BLOCK]
+            corners = starts[faces][:, None] + np.arange(size, dtype=np.int32)
+            if size == 3:
+                corner_sets.append(corners)
+                face_sets.append(faces)
+            else:
+                cut_corners, cut_faces, crossed = _cut(faces, corners, points[indices[corners]].astype(np.float64))
+                corner_sets += cut_corners
+                face_sets += cut_faces
+                crossing += crossed
     if not corner_sets:
         return np.zeros((0, 3), np.int32), np.zeros(0, np.int32), np.zeros(0, np.int64)
-    face = np.concatenate(face_sets)
-    order = np.argsort(face, kind="stable")
-    return (
-        np.concatenate(corner_sets)[order].astype(np.int32),
-        face[order].astype(np.int32),
-        np.sort(np.asarray(crossing, np.int64)),
-    )
+    face, corners = np.concatenate(face_sets), np.concatenate(corner_sets)
+    if (face[1:] < face[:-1]).any():
+        order = np.argsort(face, kind="stable")
+        face, corners = face[order], corners[order]
+    return corners, face, np.sort(np.asarray(crossing, np.int64))
+
+
+def _cut(faces: np.ndarray, corners: np.ndarray, outline: np.ndarray) -> tuple[list, list, list]:
+    """Faces of one size > 3, outlines [n, size, 3]: arrays of corners, of the face of each, faces that cross."""
+    size = corners.shape[1]
+    fan = _fan(size)
+    good = _fan_is_inside(outline, fan)
+    if good.all():
+        return [corners[:, fan].reshape(-1, 3)], [np.repeat(faces, size - 2)], []
+    corner_sets, face_sets, crossing = [], [], []
+    if size == 4:
+        other = np.array([[0, 1, 3], [1, 2, 3]])
+        turned = ~good & _fan_is_inside(outline, other)
+        corner_sets.append(corners[turned][:, other].reshape(-1, 3))
+        face_sets.append(np.repeat(faces[turned], 2))
+        # A quad without an inside diagonal is degenerate or a bow tie: both diagonals are equally wrong.
+        crossing.extend(faces[~good & ~turned])
+        good = ~turned
+    corner_sets.append(corners[good][:, fan].reshape(-1, 3))
+    face_sets.append(np.repeat(faces[good], size - 2))
+    for row in np.flatnonzero(~good) if size > 4 else ():
+        local, clean = clip_ears(_flatten(outline[row]))
+        corner_sets.append(corners[row][local])
+        face_sets.append(np.full(len(local), faces[row]))
+        if not clean:
+            crossing.append(faces[row])
+    return corner_sets, face_sets, crossing
 
 
 def newell_normals(outline: np.ndarray) -> np.ndarray:
