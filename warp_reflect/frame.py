@@ -90,12 +90,20 @@ class Frame:
         image = self._group(group)
         return image if component is None else image[..., component]
 
-    def write(self, path: str | os.PathLike, channels: list[str] | None = None) -> None:
+    def write(
+        self,
+        path: str | os.PathLike,
+        channels: list[str] | None = None,
+        attributes: dict | None = None,
+        multi_part: bool = False,
+    ) -> None:
         """Write the frame: .exr with data channels and the plan in its header, .png with the picture in sRGB.
 
         Args:
             path: Where; written to a temporary name and renamed.
             channels: Groups or components for an EXR; None: all.
+            attributes: More header entries, see `images.write_exr`.
+            multi_part: An EXR of one part per channel group instead of one part.
 
         Raises:
             KeyError: an unknown channel.
@@ -104,10 +112,10 @@ class Frame:
         """
         images.check_writable(path)
         if os.fspath(path).lower().endswith(".png"):
-            images.write_png(path, self["RGBA"][..., :3])
+            images.write_png(path, self["RGBA"][..., :3], attributes)
             return
         data = {name: self[name] for name in (channels or CHANNELS)}
-        images.write_exr(path, data, attributes=self._header())
+        images.write_exr(path, data, attributes=self._header() | (attributes or {}), multi_part=multi_part)
 
     def _header(self) -> dict:
         return {

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import os
 import stat
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from itertools import count
 from pathlib import Path
 from typing import NamedTuple
@@ -123,8 +123,9 @@ def write_exr(
     channels: Mapping[str, np.ndarray],
     half: Collection[str] = COLOR_CHANNELS,
     attributes: Mapping[str, object] | None = None,
+    multi_part: bool = False,
 ) -> int:
-    """Write a one-part EXR, ZIP-compressed, half or float32 per channel.
+    """Write an EXR, ZIP-compressed, half or float32 per channel.
 
     Args:
         path: Where; the format is EXR whatever the extension.
@@ -134,6 +135,8 @@ def write_exr(
             float32.
         attributes: Header entries. str, int and float as they are; anything else as JSON (OpenImageIO drops
             float64 entries of an EXR: a JSON list keeps every digit).
+        multi_part: One part per entry of `channels`, named by it, so that readers decode only what they want; the
+            header entries are in the first.
 
     Returns:
         Samples that were NaN or infinite and were replaced: by 0 or +-65504 in a half channel, by 0 in a
@@ -145,51 +148,56 @@ def write_exr(
     """
     import OpenImageIO as oiio
 
-    names, planes, halves = [], [], []
+    layers: list[list[tuple[str, np.ndarray, bool]]] = []
     for name, array in channels.items():
         array = np.asarray(array)
         if array.ndim not in (2, 3):
             raise ValueError(f"channel '{name}': got shape {array.shape}, expected [height, width] or [.., .., n]")
         is_half = name in half or name.rpartition(".")[0] in half
-        for suffix, plane in _split(name, array, is_half):
-            names.append(suffix)
-            planes.append(plane)
-            halves.append(is_half)
-    if not planes or 0 in planes[0].shape:
+        layers.append([(suffix, plane, is_half) for suffix, plane in _split(name, array, is_half)])
+    if not layers or 0 in layers[0][0][1].shape:
         raise ValueError(f"{path}: an image needs at least one channel and one pixel")
-    height, width = planes[0].shape
-    pixels = np.empty((height, width, len(planes)), np.float32)
-    replaced = 0
-    for k, (name, plane) in enumerate(zip(names, planes, strict=True)):
-        if plane.shape != (height, width):
-            raise ValueError(f"channel '{name}': got shape {plane.shape}, expected {(height, width)} as the first")
-        with np.errstate(over="ignore"):
-            values = plane.astype(np.float32)
-        good = np.isfinite(values)
-        if not good.all():
-            replaced += int(good.size - np.count_nonzero(good))
-            limit = HALF_MAX if halves[k] else 0.0
-            values = np.nan_to_num(values, nan=0.0, posinf=limit, neginf=-limit)
-        pixels[..., k] = np.clip(values, -HALF_MAX, HALF_MAX) if halves[k] else values
-    spec = oiio.ImageSpec(width, height, len(planes), oiio.FLOAT)
-    spec.channelnames = names
-    spec.channelformats = tuple(oiio.TypeDesc("half" if is_half else "float") for is_half in halves)
-    spec.attribute("compression", "zip")
-    spec.attribute("oiio:ColorSpace", "lin_rec709_scene")
-    spec.attribute("DateTime", "")  # the same frame is the same file
+    height, width = layers[0][0][1].shape
+    titles = list(channels)
+    if not multi_part:
+        layers, titles = [[plane for layer in layers for plane in layer]], [""]
+    replaced, parts = 0, []
+    for title, layer in zip(titles, layers, strict=True):
+        pixels = np.empty((height, width, len(layer)), np.float32)
+        for k, (name, plane, is_half) in enumerate(layer):
+            if plane.shape != (height, width):
+                raise ValueError(f"channel '{name}': got shape {plane.shape}, expected {(height, width)} as the first")
+            with np.errstate(over="ignore"):
+                values = plane.astype(np.float32)
+            good = np.isfinite(values)
+            if not good.all():
+                replaced += int(good.size - np.count_nonzero(good))
+                limit = HALF_MAX if is_half else 0.0
+                values = np.nan_to_num(values, nan=0.0, posinf=limit, neginf=-limit)
+            pixels[..., k] = np.clip(values, -HALF_MAX, HALF_MAX) if is_half else values
+        spec = oiio.ImageSpec(width, height, len(layer), oiio.FLOAT)
+        spec.channelnames = [name for name, _, _ in layer]
+        spec.channelformats = tuple(oiio.TypeDesc("half" if is_half else "float") for _, _, is_half in layer)
+        spec.attribute("compression", "zip")
+        spec.attribute("oiio:ColorSpace", "lin_rec709_scene")
+        spec.attribute("DateTime", "")  # the same frame is the same file
+        if title:
+            spec.attribute("oiio:subimagename", title)
+        parts.append((spec, pixels))
     for name, value in (attributes or {}).items():
         plain = isinstance(value, str | int | float) and not isinstance(value, bool)
-        spec.attribute(name, value if plain else json.dumps(_jsonable(value)))
-    _write_whole(Path(path), "openexr", spec, pixels)
+        parts[0][0].attribute(name, value if plain else json.dumps(_jsonable(value)))
+    _write_whole(Path(path), "openexr", parts)
     return replaced
 
 
-def write_png(path: str | os.PathLike, rgb: np.ndarray) -> int:
+def write_png(path: str | os.PathLike, rgb: np.ndarray, attributes: Mapping[str, str] | None = None) -> int:
     """Write linear colour as an 8-bit sRGB PNG (exposure 0, clipped to [0, 1]).
 
     Args:
         path: Where.
         rgb: Linear Rec.709, [height, width, 3 or 4] (straight alpha) or [height, width] (grey).
+        attributes: Text entries of the header.
 
     Returns:
         Samples that were NaN or infinite and were replaced by 0 or 1.
@@ -216,12 +224,14 @@ def write_png(path: str | os.PathLike, rgb: np.ndarray) -> int:
     spec.attribute("oiio:ColorSpace", "srgb_rec709_scene")
     spec.attribute("oiio:UnassociatedAlpha", 1)
     spec.attribute("DateTime", "")
-    _write_whole(Path(path), "png", spec, pixels)
+    for name, value in (attributes or {}).items():
+        spec.attribute(name, str(value))
+    _write_whole(Path(path), "png", [(spec, pixels)])
     return replaced
 
 
 def read_exr(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict[str, object]]:
-    """Read the channels of a frame back, whatever their order in the file.
+    """Read the channels of a frame back, whatever their order in the file and over however many parts.
 
     Returns:
         (channels, attributes). `name.X .Y (.Z)` and `name.R .G .B (.A)` come back as one float32 array
@@ -231,8 +241,14 @@ def read_exr(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict[str, 
     Raises:
         OSError: no such file, not a regular file, or not whole.
     """
-    pixels, spec = _read(Path(path), FRAME_LIMIT_MB)
-    flat = {name: pixels[..., k] for k, name in enumerate(spec.channelnames)}
+    parts = _read_parts(Path(path), FRAME_LIMIT_MB)
+    spec = parts[0][1]
+    flat = {
+        name: pixels[..., k]
+        for pixels, part in parts
+        if pixels.shape[:2] == parts[0][0].shape[:2]
+        for k, name in enumerate(part.channelnames)
+    }
     channels: dict[str, np.ndarray] = {}
     for name in flat:
         stem, dot, suffix = name.rpartition(".")
@@ -245,6 +261,15 @@ def read_exr(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict[str, 
         else:
             channels[name] = np.ascontiguousarray(flat[name])
     return channels, {item.name: _parsed(item.value) for item in spec.extra_attribs}
+
+
+def check_whole(path: str | os.PathLike) -> dict[str, object]:
+    """Decode every pixel of a picture of ours, all parts, and return the header's entries as `read_exr` does.
+
+    Raises:
+        OSError: no such file, not a regular file, or not whole.
+    """
+    return {item.name: _parsed(item.value) for item in _read_parts(Path(path), FRAME_LIMIT_MB)[0][1].extra_attribs}
 
 
 def read_image(path: str | os.PathLike, color_space: str = "auto", size_limit_mb: int = SIZE_LIMIT_MB) -> Picture:
@@ -347,8 +372,8 @@ def _part_name(path: Path) -> Path:
     return path.parent / f".{os.getpid()}-{next(_part_number)}.part"
 
 
-def _write_whole(path: Path, format_name: str, spec, pixels: np.ndarray) -> None:
-    """Write under a passing name, read the last row back, and rename: a reader never meets half a file.
+def _write_whole(path: Path, format_name: str, parts: list[tuple]) -> None:
+    """Write (spec, pixels) parts under a passing name, read back, sync and rename: a reader never meets half a file.
 
     The PNG writer returns success on a full disk and only `geterror` tells; a cut EXR keeps a valid header.
     """
@@ -359,16 +384,19 @@ def _write_whole(path: Path, format_name: str, spec, pixels: np.ndarray) -> None
     part = _part_name(final)
     try:
         output = oiio.ImageOutput.create(format_name)
-        good = output.open(str(part), spec)
-        if good:
+        specs = tuple(spec for spec, _ in parts)
+        good = output.open(str(part), specs if len(specs) > 1 else specs[0])
+        for number, (spec, pixels) in enumerate(parts):
+            if good and number:
+                good = output.open(str(part), spec, "AppendSubimage")
             # The library refuses other memory orders without a word.
-            good = output.write_image(np.ascontiguousarray(pixels))
-            good = output.close() and good
+            good = good and output.write_image(np.ascontiguousarray(pixels))
+        good = output.close() and good
         message = output.geterror()
         del output
         if not good or message:
             raise OSError(f"{path}: cannot be written: {_one_line(message, part) or 'the writer failed'}")
-        _check_last_row(path, part, spec)
+        _check_last_rows(path, part, specs)
         with open(part, "rb") as file:
             os.fsync(file.fileno())
         os.replace(part, final)
@@ -381,14 +409,17 @@ def _write_whole(path: Path, format_name: str, spec, pixels: np.ndarray) -> None
         part.unlink(missing_ok=True)
 
 
-def _check_last_row(path: Path, part: Path, spec) -> None:
+def _check_last_rows(path: Path, part: Path, specs) -> None:
     import OpenImageIO as oiio
 
     reader = oiio.ImageInput.open(str(part))
-    row = reader.read_scanline(spec.height - 1, 0, oiio.UNKNOWN) if reader else None
-    message = reader.geterror() if reader else oiio.geterror()
-    if row is None or message:
-        raise OSError(f"{path}: cannot be written: the file came out cut (is the disk full?)")
+    for number, spec in enumerate(specs):
+        row = None
+        if reader and reader.seek_subimage(number, 0):
+            row = reader.read_scanline(spec.height - 1, 0, oiio.UNKNOWN)
+        message = reader.geterror() if reader else oiio.geterror()
+        if row is None or message:
+            raise OSError(f"{path}: cannot be written: the file came out cut (is the disk full?)")
     reader.close()
 
 
@@ -410,6 +441,15 @@ def _one_line(message: str, part: Path | None = None) -> str:
 
 def _read(path: Path, size_limit_mb: int):
     """(float32 [height, width, channels], spec) of a file's first part."""
+    return next(_parts(path, size_limit_mb))
+
+
+def _read_parts(path: Path, size_limit_mb: int) -> list[tuple]:
+    """The same of every part."""
+    return list(_parts(path, size_limit_mb))
+
+
+def _parts(path: Path, size_limit_mb: int) -> Iterator[tuple]:
     import OpenImageIO as oiio
 
     try:
@@ -423,14 +463,16 @@ def _read(path: Path, size_limit_mb: int):
     reader = oiio.ImageInput.open(str(path))
     if reader is None:
         raise OSError(f"{path}: cannot be read: {_one_line(oiio.geterror()) or 'no reader knows it'}")
-    spec = reader.spec()
-    pixels = reader.read_image(oiio.FLOAT)
-    # A cut JPEG and a bad EXR chunk "succeed"; only the text says that the rest is grey.
-    message = reader.geterror()
+    for number in count():
+        if number and not reader.seek_subimage(number, 0):
+            reader.geterror()  # that there is no further part is no fault
+            break
+        spec = reader.spec()
+        pixels = reader.read_image(number, 0, 0, spec.nchannels, oiio.FLOAT)
+        # A cut JPEG and a bad EXR chunk "succeed"; only the text says that the rest is grey.
+        message = reader.geterror()
+        if pixels is None or message:
+            raise OSError(f"{path}: cannot be read: {_one_line(message) or 'the file is damaged'}")
+        pixels = np.asarray(pixels, np.float32)
+        yield (pixels[..., None] if pixels.ndim == 2 else pixels), spec
     reader.close()
-    if pixels is None or message:
-        raise OSError(f"{path}: cannot be read: {_one_line(message) or 'the file is damaged'}")
-    pixels = np.asarray(pixels, np.float32)
-    if pixels.ndim == 2:
-        pixels = pixels[..., None]
-    return pixels, spec

@@ -16,6 +16,9 @@ from functools import cache, partial
 import warp as wp
 
 SPLIT_MIN = 4096  # elements below which the hand-off (20-60 us) costs more than the second thread saves
+CORES_VARIABLE = (
+    "WARP_REFLECT_THREADS"  # environment: cores that `threads=0` means; set where processes share a machine
+)
 CPU_BLOCK_DIM = 1  # what Warp launches with on the CPU
 SLICE_ALIGN = 64  # elements; slices that share a cache line of 4-byte results would ping-pong it
 
@@ -31,6 +34,9 @@ def thread_count(device, threads: int = 0) -> int:
         return 1
     if threads > 0:
         return threads
+    allowed = os.environ.get(CORES_VARIABLE, "")
+    if allowed.isdecimal() and int(allowed) > 0:
+        return int(allowed)
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
