@@ -16,9 +16,8 @@ from functools import cache, partial
 import warp as wp
 
 SPLIT_MIN = 4096  # elements below which the hand-off (20-60 us) costs more than the second thread saves
-CORES_VARIABLE = (
-    "WARP_REFLECT_THREADS"  # environment: cores that `threads=0` means; set where processes share a machine
-)
+# Environment variable: the cores that `threads=0` means, where several processes share a machine.
+CORES_VARIABLE = "WARP_REFLECT_THREADS"
 CPU_BLOCK_DIM = 1  # what Warp launches with on the CPU
 SLICE_ALIGN = 64  # elements; slices that share a cache line of 4-byte results would ping-pong it
 

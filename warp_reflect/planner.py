@@ -128,6 +128,7 @@ def make_plan(
     size: tuple[int, int] = DEFAULT_SIZE,
     settings: Settings | None = None,
     method: str = "auto",
+    earlier: Plan | None = None,
 ) -> Plan:
     """Decide what is simulated for every reflector of a scene.
 
@@ -138,6 +139,8 @@ def make_plan(
         settings: The knobs; None: the defaults.
         method: `auto`, `reference` (every mirror traced) or a key of `TECHNIQUES`; where it does not apply the mirror
             is traced, with a note.
+        earlier: The plan of another time of the stage; what its techniques prepared is taken over where the world is
+            the same (`Scene.shares_world`). It decides nothing.
 
     Raises:
         ValueError: an unknown method, an impossible size, or no such camera.
@@ -156,7 +159,14 @@ def make_plan(
         _row(scene, view, settings, method, number, part_index, part, weight, pixels[part_index], notes)
         for number, (part_index, part, weight) in enumerate(found, 1)
     ]
-    return Plan(scene, view, settings, method, rows, notes)
+    made = Plan(scene, view, settings, method, rows, notes)
+    if earlier is not None and earlier.scene.shares_world(scene):
+        before = {row.reflector: row for row in earlier.rows}
+        for row in rows:
+            known = before.get(row.reflector)
+            if known is not None and (known.technique, known.settings) == (row.technique, row.settings):
+                made._prepared |= {k: v for k, v in earlier._prepared.items() if k == row.reflector.id}
+    return made
 
 
 def find_camera(scene: Scene, camera: str | Camera | None, size: tuple[int, int]) -> Camera:

@@ -7,7 +7,8 @@ Matrices act on columns: `p_world = world_from_object @ [p, 1]`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+import copy
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -262,7 +263,7 @@ class Scene:
     """
 
     def __init__(self, data: SceneData, device: str = "cpu", reload=None):
-        self.data = data
+        self.data = self._source = data
         self.device = wp.get_device(device)
         self.notes = list(data.notes)
         self._reload = reload
@@ -302,10 +303,28 @@ class Scene:
         return float(np.linalg.norm(np.ptp(self.host_points.astype(np.float64), axis=0))) or 1.0
 
     def at(self, time: float | None) -> Scene:
-        """The same stage at another time code; what does not change in time is read once and shared."""
+        """The same stage at another time code.
+
+        What does not change in time is read once and shared; where nothing but cameras moves, so is all that lies on
+        the device (`shares_world`).
+        """
         if self._reload is None or time == self.data.time:
             return self
-        return self._reload(time)
+        return self._reload(time, self)
+
+    def seen_at(self, data: SceneData) -> Scene | None:
+        """This scene with the time, cameras and notes of `data`; None where more than those differ."""
+        if not same_world(self._source, data):
+            return None
+        other = copy.copy(self)
+        other.data = replace(self.data, time=data.time, cameras=data.cameras, notes=data.notes)
+        other.notes = [*data.notes, *self.notes[len(self._source.notes) :]]
+        other._source = data
+        return other
+
+    def shares_world(self, other: Scene) -> bool:
+        """Whether two scenes are the same arrays, seen at two times."""
+        return self.view is other.view
 
     @cached_property
     def _host_neighbours(self) -> np.ndarray:
@@ -525,6 +544,36 @@ def _scene_origin(data: SceneData) -> np.ndarray:
         middle = 0.5 * (points.min(axis=0) + points.max(axis=0)).astype(np.float64) if len(points) else np.zeros(3)
         centres.append(inst.world_from_object[:3, :3] @ middle + inst.world_from_object[:3, 3])
     return np.median(np.asarray(centres), axis=0)
+
+
+def same_world(a: SceneData, b: SceneData) -> bool:
+    """Whether two readings hold the same geometry, materials and lights; times, cameras and notes may differ."""
+    return (
+        len(a.meshes) == len(b.meshes)
+        and len(a.instances) == len(b.instances)
+        and a.materials == b.materials
+        and all(_same(x, y) for x, y in zip(a.instances, b.instances, strict=True))
+        and all(_same(x, y) for x, y in zip(a.meshes, b.meshes, strict=True))
+        and _same(a.lights, b.lights)
+        and _same(a.pictures, b.pictures)
+    )
+
+
+def _same(a, b) -> bool:
+    """Equality of what a `SceneData` holds: arrays by their numbers."""
+    if a is b:
+        return True
+    if isinstance(a, np.ndarray):
+        return isinstance(b, np.ndarray) and a.shape == b.shape and a.dtype == b.dtype and bool((a == b).all())
+    if type(a) is not type(b):
+        return False
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(_same(a[key], b[key]) for key in a)
+    if isinstance(a, list | tuple):
+        return len(a) == len(b) and all(_same(x, y) for x, y in zip(a, b, strict=True))
+    if is_dataclass(a):
+        return all(_same(getattr(a, each.name), getattr(b, each.name)) for each in fields(a))
+    return a == b
 
 
 def edge_neighbours(triangles: np.ndarray) -> np.ndarray:

@@ -21,7 +21,8 @@ def load_stage(
 ) -> Scene:
     """Read a USD stage at one time and put it on a device.
 
-    `scene.at(time)` reads the same open stage at another time; meshes that do not change are not read again.
+    `scene.at(time)` reads the same open stage at another time; meshes that do not change are not read again, and a
+    world in which only cameras move is not prepared again.
 
     Args:
         path: A .usd, .usda, .usdc or .usdz file.
@@ -46,8 +47,9 @@ def load_stage(
     arguments = path, purposes, complexity, strict, Limits(root=str(root)), reflectors
     reader = None if untrusted else StageReader(*arguments)
 
-    def at(code: float | None) -> Scene:
+    def at(code: float | None, known: Scene | None = None) -> Scene:
         data = read_untrusted(path, code, *arguments[1:]) if reader is None else reader.read(code)
-        return Scene(data, device, reload=at)
+        seen = known.seen_at(data) if known is not None else None
+        return Scene(data, device, reload=at) if seen is None else seen
 
     return at(time)

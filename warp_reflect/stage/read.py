@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Iterator
+from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -88,11 +90,14 @@ class StageReader:
         self.stage = open_stage(self.path, self.limits)
         self._static: dict[tuple, MeshEntry] = {}
         self._pictures: dict = {}
+        self._first: SceneData | None = None
 
     def read(self, time: float | None = None) -> SceneData:
         """The stage at one time; see `read_stage`."""
         if time is not None and not math.isfinite(time):
             raise ValueError(f"time: got {time}, expected a finite time code")
+        if self._first is not None and self._is_still:
+            return replace(self._first, time=time, notes=list(self._first.notes))
         code = Usd.TimeCode.EarliestTime() if time is None else Usd.TimeCode(float(time))
         intake = Intake(code, self.strict, self.limits, cache=self._pictures)
         try:
@@ -103,7 +108,20 @@ class StageReader:
         if self.reflectors:
             override_reflectors(data, self.reflectors)
         data.notes = intake.notes
+        self._first = self._first or data
         return data
+
+    @cached_property
+    def _is_still(self) -> bool:
+        """Whether no attribute of the stage may change in time."""
+        roots = [self.stage.GetPseudoRoot(), *self.stage.GetPrototypes()]
+        with quiet():
+            return not any(
+                attribute.ValueMightBeTimeVarying()
+                for root in roots
+                for prim in Usd.PrimRange(root)
+                for attribute in prim.GetAuthoredAttributes()
+            )
 
     def _read(self, time: float | None, intake: Intake) -> SceneData:
         data = self._metadata(time, intake)
