@@ -71,6 +71,9 @@ LOOKS = {
     "Steel": Look((0.35, 0.36, 0.38)),
     "Daylight": Look((0.2, 0.2, 0.2), emissive=(0.45, 0.7, 1.0)),
     "Meadow": Look((0.1, 0.2, 0.05), emissive=(0.18, 0.38, 0.1)),
+    "Stone": Look((0.55, 0.47, 0.36)),
+    "Sandstone": Look((0.62, 0.45, 0.27)),
+    "Rubber": Look((0.03, 0.03, 0.035)),
     "Lamp": Look((0.5, 0.5, 0.5), emissive=(1.4, 1.2, 0.85)),
 }
 
@@ -528,6 +531,80 @@ def _toy_block(d: Detail) -> Pieces:
     return [("Body", block((side, side, side), d, 0.014, 0.08), None), ("Dots", dots, "Lemon")]
 
 
+# The car
+
+CAR_AXLES, CAR_WHEEL = (1.36, -1.34), 0.33  # where the wheels are along the car, and their radius [m]
+CAR_ARCH = 0.43  # radius of the openings around them
+CAR_GROUND = 0.21  # height of the floor plate
+
+
+def _car_section(z: float) -> np.ndarray:
+    """Right half of the cage's cross section at z, points (x, y) from the floor's middle to the roof's, [14, 2].
+
+    Profiles over z are piecewise linear: the subdivision rounds them.
+    """
+
+    def along(*knots: tuple[float, float]) -> float:
+        return float(np.interp(z, *zip(*knots, strict=True)))
+
+    deck = along(
+        (-2.25, 0.66), (-2.1, 0.86), (-1.6, 0.93), (-0.4, 0.92), (0.9, 0.9), (1.7, 0.83), (2.1, 0.74), (2.25, 0.56)
+    )
+    cabin = along((-1.75, 0.0), (-1.0, 0.86), (-0.55, 1.0), (0.05, 1.0), (0.3, 0.93), (1.0, 0.0))
+    width = along((-2.25, 0.7), (-2.12, 0.82), (-1.7, 0.88), (0.0, 0.88), (1.7, 0.89), (2.08, 0.83), (2.25, 0.66))
+    floor = along((-2.25, 0.36), (-2.1, 0.24), (-1.9, CAR_GROUND), (1.9, CAR_GROUND), (2.1, 0.24), (2.25, 0.34))
+    reach = min(abs(z - axle) for axle in CAR_AXLES)
+    arch = math.sqrt(max(CAR_ARCH**2 - reach**2, 0.0))
+    sill = max(floor, CAR_WHEEL - 0.02 + arch) if arch > 0.0 else floor
+    flare = 0.035 * arch / CAR_ARCH
+    top = deck + 0.035 + 0.5 * cabin
+    waist = deck - 0.06
+    lean = 0.02 * (1.0 - cabin)  # a bonnet is a little crowned, where a cabin has its side windows
+    return np.array(
+        [
+            (0.0, floor - 0.02),
+            (0.58 * width, floor),
+            (0.62 * width, sill),
+            (0.94 * width + flare, sill),
+            (0.995 * width + flare, sill + 0.04),
+            (1.01 * width + 0.8 * flare, sill + 0.55 * (waist - sill)),
+            (width, waist),
+            (0.94 * width, deck),
+            (0.86 * width, deck + lean),
+            ((0.66 + 0.12 * cabin) * width, deck + 0.02 + 0.22 * cabin),
+            ((0.5 + 0.17 * cabin) * width, top - 0.1 * cabin),
+            ((0.34 + 0.2 * cabin) * width, top - 0.02 * cabin),
+            (0.2 * width, top),
+            (0.0, top + 0.01),
+        ]
+    )
+
+
+def _car_shell(d: Detail) -> Pieces:
+    """The control cage of a car's body, front +Z, wheels to stand on y = 0; neither convex nor star-shaped."""
+    stops = [-2.25, -2.16, -2.04, -1.9, -0.7, -0.4, -0.1, 0.2, 0.5, 0.75, 1.88, 2.0, 2.1, 2.18, 2.25]
+    for axle in CAR_AXLES:
+        stops += [axle + CAR_ARCH * share for share in (-1.04, -0.99, -0.85, -0.5, 0.0, 0.5, 0.85, 0.99, 1.04)]
+    stops = np.sort(stops)[::-1]  # from the front on, so that the skin faces outwards
+    fine = d.count(1)
+    stops = np.interp(np.arange((len(stops) - 1) * fine + 1) / fine, np.arange(len(stops)), stops)
+    half = np.array([_car_section(z) for z in stops])
+    right = np.concatenate([half, np.broadcast_to(stops[:, None, None], (*half.shape[:2], 1))], axis=-1)
+    left = right[:, -2:0:-1] * (-1.0, 1.0, 1.0)
+    ring = np.concatenate([right, left], axis=1)
+    n, last = ring.shape[1], half.shape[1] - 1
+    skin = patch(ring, wrap_columns=True)
+    caps = []
+    for first, flip in ((0, False), ((len(stops) - 1) * n, True)):
+        for k in range(last):
+            quad = [k, k + 1, (n - k - 1) % n, (n - k) % n]
+            face = [first + v for v in dict.fromkeys(quad)]
+            caps.append(face[::-1] if flip else face)
+    counts = np.concatenate([skin.counts, [len(face) for face in caps]])
+    indices = np.concatenate([skin.indices, np.concatenate(caps)])
+    return [("Body", Surface(skin.points, counts, indices, scheme="catmullClark"), None)]
+
+
 PARTS: dict[str, Callable[[Detail], Pieces]] = {
     "apple": _apple,
     "balloon": _balloon,
@@ -537,6 +614,7 @@ PARTS: dict[str, Callable[[Detail], Pieces]] = {
     "book_row": _book_row,
     "bottle": _bottle,
     "bowl": _bowl,
+    "car_shell": _car_shell,
     "chair": _chair,
     "clock": _clock,
     "cloth": _cloth,
@@ -569,5 +647,6 @@ PARTS: dict[str, Callable[[Detail], Pieces]] = {
     "toy_block": _toy_block,
     "wall_ochre": _tiled_wall(7, *["tiles_ochre"] * 4),
     "wall_play": _tiled_wall(8, *["tiles_play"] * 4, *["tiles_peach"] * 4),
+    "wall_teal": _tiled_wall(7, *["tiles_teal"] * 4),
     "wall_unit": _wall_unit,
 }

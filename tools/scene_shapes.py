@@ -25,7 +25,8 @@ class Detail:
 class Surface:
     """A polygon mesh: points [n, 3], vertices per face [f], indices, unit normals [n, 3] or None (flat).
 
-    `color_index` [f] into `palette` gives every face a displayColor; None: one material for all.
+    `color_index` [f] into `palette` gives every face a displayColor; None: one material for all. `scheme` is
+    UsdGeomMesh's subdivisionScheme: with "catmullClark" the polygons are a control cage, without normals.
     """
 
     points: np.ndarray
@@ -34,6 +35,7 @@ class Surface:
     normals: np.ndarray | None = None
     palette: tuple[tuple[float, float, float], ...] = ()
     color_index: np.ndarray | None = None
+    scheme: str = "none"
 
     @property
     def triangle_count(self) -> int:
@@ -321,3 +323,26 @@ class Egg:
         points, normals = self.meridian(np.linspace(-math.pi / 2, math.pi / 2, detail.count(bands) + 1))
         points[[0, -1], 0] = normals[[0, -1], 0] = 0.0  # the poles, where rounding leaves 1e-17
         return revolve(points[:, 0], points[:, 1], detail.count(segments), normals)
+
+
+def dome(radius: float, height: float, detail: Detail, segments: int, bands: int) -> Surface:
+    """A closed paraboloid of revolution y = height (1 - r^2 / radius^2) over a flat base in y = 0, normals exact."""
+    n = detail.count(bands)
+    r = radius * np.linspace(1.0, 0.0, n + 1)
+    around = detail.count(segments)
+    slope = np.stack([2.0 * height * r / radius**2, np.ones_like(r)], -1)  # the gradient of y + height r^2 / radius^2
+    side = revolve(r, height * (1.0 - (r / radius) ** 2), around, slope)
+    base = revolve([0.0, radius], [0.0, 0.0], around, [(0.0, -1.0), (0.0, -1.0)])
+    return merge(base, side)
+
+
+def spherical_cap(radius: float, half_angle: float, detail: Detail, segments: int, bands: int) -> Surface:
+    """The bottom of a sphere, seen from inside: open, its lowest point at the origin, its axis +Y; normals exact.
+
+    Args:
+        radius: Of the sphere; the focus of the mirror is half of it above the origin.
+        half_angle: Of the cap, seen from the sphere's centre. [degrees]
+    """
+    t = np.radians(half_angle) * np.linspace(1.0, 0.0, detail.count(bands) + 1)
+    r, y = radius * np.sin(t), radius * (1.0 - np.cos(t))
+    return revolve(r, y, detail.count(segments), np.stack([-np.sin(t), np.cos(t)], -1))
