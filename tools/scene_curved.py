@@ -266,7 +266,7 @@ def _car_body(w: Writer) -> None:
     )
     for k, (name, x, z, turn, size, look) in enumerate(things):
         w.part(f"/World/Things/T{k}", name, (x, 0, z), (0, turn, 0), size, look)
-    w.camera((3.9, 1.75, 5.0), (0.0, 0.62, 0.1), 25)
+    w.camera((4.05, 1.8, 5.2), (0.05, 0.6, 0.1), 25.5)
     w.lights(sun_rotate=(-55, 40, 0))
 
 

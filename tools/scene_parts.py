@@ -582,7 +582,7 @@ def _car_section(z: float) -> np.ndarray:
 
 def _car_shell(d: Detail) -> Pieces:
     """The control cage of a car's body, front +Z, wheels to stand on y = 0; neither convex nor star-shaped."""
-    stops = [-2.25, -2.16, -2.04, -1.9, -0.7, -0.4, -0.1, 0.2, 0.5, 0.75, 1.88, 2.0, 2.1, 2.18, 2.25]
+    stops = [-2.25, -2.2, -2.13, -2.04, -1.94, -1.85, *np.linspace(-0.82, 0.84, 15), 1.86, 1.94, 2.03, 2.11, 2.18, 2.25]
     for axle in CAR_AXLES:
         stops += [axle + CAR_ARCH * share for share in (-1.04, -0.99, -0.85, -0.5, 0.0, 0.5, 0.85, 0.99, 1.04)]
     stops = np.sort(stops)[::-1]  # from the front on, so that the skin faces outwards
