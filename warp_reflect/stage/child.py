@@ -11,7 +11,7 @@ def main() -> int:
     """Read one stage under limits; 0 if there is an answer, be it an error message."""
     arguments = json.load(sys.stdin)
     folder = Path(arguments.pop("folder"))
-    _limit_memory(arguments.pop("memory_bytes"))
+    limit_memory(arguments.pop("memory_bytes"))
     from warp_reflect.stage.guard import Limits
     from warp_reflect.stage.layers import check_layers
     from warp_reflect.stage.read import read_stage
@@ -32,7 +32,8 @@ def main() -> int:
     return 0
 
 
-def _limit_memory(size: int) -> None:
+def limit_memory(size: int) -> None:
+    """Bound the address space of this process and leave no core file."""
     try:
         import resource
     except ImportError:  # not on Windows: there the time limit alone holds
