@@ -130,6 +130,21 @@ def test_channels_are_found_by_name(tmp_path):
     assert grey.cleaned == 0
 
 
+@pytest.mark.parametrize("name", ["a.png", "a.tga", "a.tif"])
+def test_colour_under_alpha_is_read_as_stored(tmp_path, name):
+    stored = np.full((2, 3, 4), 200, np.uint8)
+    stored[..., 3] = [0, 100, 255]
+    spec = oiio.ImageSpec(3, 2, 4, oiio.UINT8)
+    spec.attribute("oiio:UnassociatedAlpha", 1)
+    writer = oiio.ImageOutput.create(str(tmp_path / name))
+    writer.open(str(tmp_path / name), spec)
+    writer.write_image(stored)
+    writer.close()
+    picture = images.read_image(tmp_path / name)
+    assert np.allclose(images.srgb_from_linear(picture.rgb), 200 / 255, atol=1e-6)
+    assert np.allclose(picture.alpha, np.array([0, 100, 255]) / 255, atol=1e-6)
+
+
 def test_grey_8_bit_stays_as_stored_and_colour_is_decoded(tmp_path):
     grey = images.read_image(save(tmp_path / "g.png", ["Y"], np.full((3, 3, 1), 0.5), "uint8"))
     assert grey.rgb[0, 0, 0] == pytest.approx(0.5, abs=2e-3)

@@ -460,7 +460,10 @@ def _parts(path: Path, size_limit_mb: int) -> Iterator[tuple]:
         raise FileNotFoundError(f"{path}: cannot be read: no such file") from None
     oiio.attribute("limits:imagesize_MB", int(size_limit_mb))
     oiio.attribute("limits:resolution", SIDE_LIMIT)
-    reader = oiio.ImageInput.open(str(path))
+    config = oiio.ImageSpec()
+    # Formats that store colour apart from alpha are taken as stored: textures are not multiplied by their alpha.
+    config.attribute("oiio:UnassociatedAlpha", 1)
+    reader = oiio.ImageInput.open(str(path), config)
     if reader is None:
         raise OSError(f"{path}: cannot be read: {_one_line(oiio.geterror()) or 'no reader knows it'}")
     for number in count():
