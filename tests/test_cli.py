@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_reflect import cli, images
+from warp_reflect import cli, devices, images
 from warp_reflect.channels import CHANNELS
 from warp_reflect.stage.frames import frame_name, has_frame_pattern, parse_frames
 from warp_reflect.techniques import TECHNIQUES
@@ -376,7 +376,7 @@ def cached_module(tmp_path, device) -> Path:
 
 
 def test_whole_cached_kernels_are_kept(cached_module):
-    assert cli.heal_kernel_cache(cached_module.parent) == []
+    assert devices.heal_kernel_cache(cached_module.parent) == []
     assert cached_module.is_dir()
 
 
@@ -387,7 +387,7 @@ def test_cut_cached_kernels_are_found(cached_module, suffix, share, device):
         suffix = ".cubin"
     file = next(path for path in cached_module.iterdir() if path.suffix == suffix)
     os.truncate(file, int(share * file.stat().st_size))
-    assert cli.heal_kernel_cache(cached_module.parent) == [cached_module]
+    assert devices.heal_kernel_cache(cached_module.parent) == [cached_module]
     assert not cached_module.exists()
 
 
@@ -395,14 +395,14 @@ def test_kernels_that_another_process_compiles_are_left_alone(cached_module):
     building = cached_module.rename(f"{cached_module}_p123_t140415733521280")
     for file in building.iterdir():
         os.truncate(file, 0)
-    assert cli.heal_kernel_cache(building.parent) == []
+    assert devices.heal_kernel_cache(building.parent) == []
     assert building.is_dir()
 
 
 LOAD = """
 import warp as wp
-from warp_reflect import channels, cli
-cli._open_device("cpu")
+from warp_reflect import channels, devices
+devices.open_device("cpu")
 wp.load_module("warp_reflect.channels", device="cpu")
 print(wp.config.kernel_cache_dir)
 """
@@ -413,7 +413,7 @@ def test_cut_kernels_are_compiled_again_in_one_start(cached_module, device):
         os.truncate(file, file.stat().st_size // 2)
     done = python(LOAD, WARP_CACHE_PATH=str(cached_module.parents[1]))
     assert done.returncode == 0, done.stderr
-    assert cli.heal_kernel_cache(cached_module.parent) == []
+    assert devices.heal_kernel_cache(cached_module.parent) == []
 
 
 def test_cache_folder_that_cannot_be_made_is_replaced_for_the_run(tmp_path):
@@ -427,8 +427,8 @@ def test_cache_folder_that_cannot_be_made_is_replaced_for_the_run(tmp_path):
 
 def test_read_only_cache_lends_its_kernels(cached_module, monkeypatch):
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(cached_module.parent))
-    monkeypatch.setattr(cli, "_is_writable", lambda folder: False)
-    cli._open_device("cpu")
+    monkeypatch.setattr(devices, "_is_writable", lambda folder: False)
+    devices.open_device("cpu")
     copy = Path(wp.config.kernel_cache_dir)
     assert copy != cached_module.parent
     assert [path.name for path in copy.iterdir()] == [cached_module.name]

@@ -6,33 +6,25 @@ Results go to standard output, notes and errors to standard error. Exit 0: done;
 
 from __future__ import annotations
 
-import atexit
 import json
 import os
-import re
-import shutil
 import sys
-import tempfile
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from time import perf_counter
 from typing import Annotated
 
 import cyclopts
-import warp as wp
 from cyclopts import Parameter
 
 from warp_reflect import images
+from warp_reflect.devices import open_device as _open_device
 
 DONE, PART_WAY, IMPOSSIBLE = 0, 1, 2
 NOTES_SHOWN = 40  # a stage of thousands of prims may have thousands; `plan --json` has them all
 SIDE_MAX = 32768  # pixels; what the image readers of this package accept back
-
-# Warp compiles into such a folder (process, thread) and renames it when it is whole; another process may be at it.
-BEING_WRITTEN = re.compile(r"_p\d+_t\d+$")
 
 # What a user's input can cause; anything else is a fault of this program.
 REFUSALS = (ValueError, KeyError, OSError, NotImplementedError, MemoryError)
@@ -73,7 +65,9 @@ class PlanOptions:
     method: str = "auto"
     """auto, reference (every mirror ray traced) or a technique."""
     reflector: Annotated[list[str] | None, Parameter(negative=())] = None
-    """Make mirrors of the prims, materials or collection that this path, name or pattern (* and ?) names; repeatable."""
+    """Make mirrors of the prims, materials or collection that this path, name or pattern (* and ?) names; repeatable.
+    They become neutral metal; end it in :color=keep (or one number or three), :roughness=R, :metallic=M or :technique=T
+    for another, as in '/World/Car*:color=keep:roughness=0.1'."""
     set_: Annotated[list[str] | None, Parameter(name="--set", negative=())] = None
     """A setting, name=value; repeatable."""
     complexity: Annotated[str | None, Parameter(name=["--complexity", "-c"])] = None
@@ -433,119 +427,6 @@ def _progress(total: int = 1) -> Iterator[Callable]:
             progress.update(task, description=text, completed=frames_done)
 
         yield show
-
-
-# The machine.
-
-
-def _open_device(name: str) -> str:
-    """Start Warp quietly, with a kernel cache that works; returns the name of the device.
-
-    Raises:
-        ValueError: no such device here.
-    """
-    if hasattr(wp.config, "log_level"):
-        wp.config.log_level = wp.LOG_WARNING
-    else:
-        wp.config.quiet = True  # Warp before 1.12
-    with _without_driver_warning():
-        try:
-            wp.init()
-        except OSError:
-            # The cache folder cannot be made: another home for it.
-            wp.config.kernel_cache_dir = _temporary_cache()
-            wp.init()
-    cache = Path(wp.config.kernel_cache_dir)
-    if not _is_writable(cache):
-        wp.config.kernel_cache_dir = _temporary_cache(cache)
-    heal_kernel_cache(Path(wp.config.kernel_cache_dir))
-    known = [device.alias for device in wp.get_devices()]
-    if name not in known and name != "cuda":
-        raise ValueError(f"--device: got '{name}', this machine has {', '.join(known)}")
-    return str(wp.get_device(name))
-
-
-@contextmanager
-def _without_driver_warning() -> Iterator[None]:
-    """Drop the line that Warp's native code prints on every machine without CUDA; pass everything else on."""
-    sys.stderr.flush()
-    with tempfile.TemporaryFile() as caught:
-        kept = os.dup(2)
-        os.dup2(caught.fileno(), 2)
-        try:
-            yield
-        finally:
-            os.dup2(kept, 2)
-            os.close(kept)
-            caught.seek(0)
-            for line in caught.read().decode(errors="replace").splitlines():
-                if "Could not find or load the NVIDIA CUDA driver" not in line:
-                    _tell(line)
-
-
-def _is_writable(folder: Path) -> bool:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            return True
-    except OSError:
-        return False
-
-
-def _temporary_cache(source: Path | None = None) -> str:
-    """A kernel cache for this process alone, with the compiled kernels of a cache that can only be read."""
-    folder = Path(tempfile.mkdtemp(prefix="warp_reflect_kernels_"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    if source is not None and source.is_dir():
-        for module in source.glob("wp_warp_reflect*"):
-            shutil.copytree(module, folder / module.name, dirs_exist_ok=True)
-    return str(folder)
-
-
-def heal_kernel_cache(cache: Path) -> list[Path]:
-    """Delete cached modules of this package that were cut short; they are compiled again when needed.
-
-    A full disk or a crash leaves such files, and Warp would fail on them at every start.
-
-    Returns:
-        The folders deleted.
-    """
-    damaged = [
-        folder
-        for folder in cache.glob("wp_warp_reflect*")
-        if folder.is_dir() and not BEING_WRITTEN.search(folder.name) and not _is_whole(folder)
-    ]
-    for folder in damaged:
-        shutil.rmtree(folder, ignore_errors=True)
-    return damaged
-
-
-def _is_whole(folder: Path) -> bool:
-    try:
-        for file in folder.iterdir():
-            if file.suffix == ".meta":
-                json.loads(file.read_text())
-            elif file.suffix in (".o", ".cubin") and not _is_whole_elf(file):
-                return False
-            elif file.suffix == ".ptx" and file.stat().st_size == 0:
-                return False
-    except (OSError, ValueError):
-        return False
-    return True
-
-
-def _is_whole_elf(file: Path) -> bool:
-    """Whether a 64-bit ELF file holds all of its section table; other formats: whether it has data."""
-    size = file.stat().st_size
-    with file.open("rb") as stream:
-        head = stream.read(64)
-    if head[:5] != b"\x7fELF\x02":
-        return len(head) > 0 and not b"\x7fELF".startswith(head[:4])
-    if len(head) < 64:
-        return False
-    table = int.from_bytes(head[40:48], "little")
-    entry, entries = int.from_bytes(head[58:60], "little"), int.from_bytes(head[60:62], "little")
-    return size >= table + entry * entries
 
 
 if __name__ == "__main__":
