@@ -22,7 +22,7 @@ FILES = {
 FLOORS = {
     1: "settings launch devices optics shapes bodies cubemap quadrics quadric_roots quadric_curve heightfield "
     "images metrics timing",
-    2: "scene layers bvh raster shade surface textures direct channels stage stage.*",
+    2: "scene segments layers bvh raster shade surface textures normal_maps direct channels stage stage.*",
     3: "solve solver solve_device solve_plane solve_convex solve_map solve_general solve_qim solver_gradients mirrors "
     "reflector_maps techniques techniques.* finishes finishes.*",
     4: "planner budget frame motion sweep",
@@ -42,6 +42,7 @@ HOMES = {
     "dask": ("pipeline",),
     "scipy": (),
     "embreex": (),
+    "MaterialX": ("stage",),
 }
 HEAVY = (
     "pxr",
@@ -54,6 +55,7 @@ HEAVY = (
     "matplotlib",
     "embreex",
     "scipy",
+    "MaterialX",
 )
 LINES_MAX = 900
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -130,3 +130,98 @@ def _solid_angle(corner: np.ndarray) -> float:
     triple = np.einsum("ij,ij->i", a, np.cross(b, c))
     dots = [np.einsum("ij,ij->i", x, y) for x, y in ((a, b), (b, c), (c, a))]
     return float(2.0 * np.arctan2(triple, la * lb * lc + dots[0] * lc + dots[1] * la + dots[2] * lb).sum())
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """An open mesh as a part of the surface of a convex body, its *companion*.
+
+    The companion is what lies behind the tangent planes of the sheet's rim and in a box: it continues the sheet without an
+    edge and closes far from it.
+
+    Attributes:
+        centre: A point of the companion that sees the whole sheet from behind, float64 [3].
+        axes: Rows are the box's axes, right-handed, float64 [3, 3].
+        extent: The box's half extents along the axes about the centre, float64 [3].
+        cosine: Least cosine between a facet's normal and the ray from the centre to it: above 0 the sheet is star-shaped.
+        overhang: Of the sheet's size: by how much a corner stands out over the plane of a facet; 0 if truly convex.
+        inner: The body lies before the sheet's winding side: it is concave seen from its front.
+    """
+
+    centre: np.ndarray
+    axes: np.ndarray
+    extent: np.ndarray
+    cosine: float
+    overhang: float
+    inner: bool
+
+    def placed(self, scale: float, offset: np.ndarray) -> Sheet:
+        """The same for the mesh times a scale plus an offset."""
+        return replace(self, centre=self.centre * scale + offset, extent=self.extent * scale)
+
+
+SHEET_SAMPLES = 384  # planes and corners that stand for a sheet's where each meets each
+DEPTHS = 25  # places tried for the centre
+DEPTH_MAX = 0.6  # of the sheet's size, behind its middle: deeper, the sheet fills too little of its map
+BOX_MARGIN = 0.3  # of the half extents: the companion's sides stay clear of the sheet
+EXTENT_MIN = 0.05  # of the largest half extent: a flat sheet's companion is a slab
+
+
+def fit_sheet(corner: np.ndarray, inner: bool) -> Sheet:
+    """Frame of a sheet's companion, and how well it fits.
+
+    Args:
+        corner: Corners of its triangles, float64 [n, 3, 3], counter-clockwise seen from the front.
+        inner: Whether the companion lies in front (the sheet is concave) or behind.
+    """
+    flat = corner.reshape(-1, 3)
+    low, high = flat.min(axis=0), flat.max(axis=0)
+    size = float((high - low).max()) or 1.0
+    local = (corner - 0.5 * (low + high)) / size
+    facet = np.cross(local[:, 1] - local[:, 0], local[:, 2] - local[:, 0]) * (-1.0 if inner else 1.0)
+    area = np.linalg.norm(facet, axis=1)
+    solid = area > 1.0e-9 * max(float(area.max(initial=0.0)), 1.0e-300)
+    local, facet, area = local[solid], facet[solid], area[solid]
+    unit = facet / area[:, None]
+    mean = facet.sum(axis=0) / area.sum()
+    openness = float(np.linalg.norm(mean))
+    axes, middle, _ = _principal_frame(local, area)
+    depth = np.linspace(-0.3 * DEPTH_MAX, DEPTH_MAX, DEPTHS) if openness > 1.0e-6 else np.zeros(1)
+    places = middle - depth[:, None] * mean / max(openness, 1.0e-12)
+    some = local[_spread(len(local), 4 * SHEET_SAMPLES)]
+    some_unit = unit[_spread(len(local), 4 * SHEET_SAMPLES)]
+    towards = some.mean(axis=1)[None] - places[:, None]
+    cosine = np.einsum("pnj,nj->pn", towards, some_unit) / np.maximum(np.linalg.norm(towards, axis=2), 1.0e-12)
+    best = int(cosine.min(axis=1).argmax())
+    centre = places[best]
+    towards = local.mean(axis=1) - centre
+    exact = np.einsum("ij,ij->i", towards, unit) / np.maximum(np.linalg.norm(towards, axis=1), 1.0e-12)
+    above = overhang(local[_spread(len(local), SHEET_SAMPLES)], inner, local)
+    extent = np.abs((local.reshape(-1, 3) - centre) @ axes.T).max(axis=0)
+    extent = np.maximum(extent, EXTENT_MIN * extent.max()) * (1.0 + BOX_MARGIN)
+    result = Sheet(centre, axes, extent, float(exact.min()), float(above.max()), inner)
+    return result.placed(size, 0.5 * (low + high))
+
+
+def overhang(facets: np.ndarray, inner: bool, sheet: np.ndarray | None = None) -> np.ndarray:
+    """By how much a sheet stands out over the planes of facets, of its size; float64 [n], at least 0.
+
+    Args:
+        facets: Corners, float64 [n, 3, 3].
+        inner: The planes' outside is their back.
+        sheet: Corners of the triangles that may stand out; None: the facets themselves.
+    """
+    tips = (facets if sheet is None else sheet).reshape(-1, 3)
+    tips = tips[_spread(len(tips), 4 * SHEET_SAMPLES)]
+    normal = np.cross(facets[:, 1] - facets[:, 0], facets[:, 2] - facets[:, 0]) * (-1.0 if inner else 1.0)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1.0e-300)
+    height = np.empty(len(facets))
+    for first in range(0, len(facets), 4096):
+        block = slice(first, first + 4096)
+        height[block] = (normal[block] @ tips.T).max(axis=1) - np.einsum("ij,ij->i", normal[block], facets[block, 0])
+    return np.maximum(height, 0.0) / max(float(np.ptp(tips, axis=0).max()), 1.0e-300)
+
+
+def _spread(count: int, wanted: int) -> np.ndarray:
+    """At most `wanted` of `count` numbers at equal steps."""
+    return np.unique(np.linspace(0, count - 1, min(count, wanted)).astype(np.int64))

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from warp_reflect.bodies import analyse
+from warp_reflect.bodies import Sheet, analyse, weld
 from warp_reflect.cubemap import FACE_COUNT, cube_point, face_axes, node_directions
 from warp_reflect.launch import launch
 from warp_reflect.layers import CameraView
@@ -23,7 +23,10 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class ReflectorMapView:
-    """Position and normal per node in the reflector's unit frame: texel i is elements 2i (P, 0) and 2i+1 (N, 0)."""
+    """Position and normal per node in the reflector's unit frame: texel i is elements 2i (P, mask) and 2i+1 (N, 0).
+
+    The mask is 1 on the reflector and 0 on what closes an open one.
+    """
 
     texels: wp.array(dtype=wp.vec4)
     resolution: int
@@ -32,6 +35,7 @@ class ReflectorMapView:
     inner_radius: float  # the whitened body contains the ball of this radius
     outer_radius: float  # and lies in the ball of this one
     least_curvature: float  # of an ellipsoid with these extents [1/unit]
+    greatest_curvature: float
 
 
 @wp.struct
@@ -98,10 +102,10 @@ def sample_map(map: ReflectorMapView, x: wp.vec3) -> MapSample:
 
 @dataclass(frozen=True)
 class ReflectorMap:
-    """Position and normal cube maps of a closed, convex body.
+    """Position and normal cube maps of a convex body: a closed reflector, or an open one's companion.
 
     Attributes:
-        texels: float32 [6, n, n, 8]: position, 0, unit normal, 0, in the unit frame.
+        texels: float32 [6, n, n, 8]: position, mask (1 reflector, 0 its closing part), unit outward normal, 0, unit frame.
         unit_from_body: float64 [4, 4], a similarity: principal axes, centre at 0, largest half extent 1.
         extent: Half extents in the unit frame, float64 [3].
         inner_radius, outer_radius: The whitened body contains, and lies in, these balls.
@@ -145,38 +149,123 @@ class ReflectorMap:
         body = body or analyse(points, faces)
         if not body.convex:
             raise ValueError(f"faces: {body.reason or 'not convex'}; a reflector map needs a closed convex body")
-        scale = 1.0 / float(body.extent.max())
-        unit_from_body = np.eye(4)
-        unit_from_body[:3, :3] = scale * body.axes
-        unit_from_body[:3, 3] = -unit_from_body[:3, :3] @ body.centre
-        local = points @ unit_from_body[:3, :3].T + unit_from_body[:3, 3]
-        extent = body.extent * scale
-        normals = _smooth_normals(local, faces) if normals is None else np.asarray(normals, np.float64) @ body.axes.T
-        cube = node_directions(resolution)
-        directions = cube * extent
-        directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
-        triangle = _draw_faces((local / extent).astype(np.float32), faces, resolution)
-        position, normal = _surface_along(local, faces, normals, triangle, directions.reshape(-1, 3))
-        if polish is not None:
-            world_directions = directions.reshape(-1, 3) @ body.axes
-            distance = np.linalg.norm(position, axis=1) / scale
-            distance, body_normal = polish(triangle, body.centre, world_directions, distance)
-            position = directions.reshape(-1, 3) * (distance * scale)[:, None]
-            analytic = np.linalg.norm(body_normal, axis=1) > 0.5
-            normal[analytic] = body_normal[analytic] @ body.axes.T
-        texels = np.zeros((FACE_COUNT, resolution, resolution, 8), np.float32)
-        texels[..., 0:3] = position.reshape(cube.shape)
-        texels[..., 4:7] = normal.reshape(cube.shape)
-        inner, outer = _whitened_radii(local / extent, faces, position / extent)
-        view = ReflectorMapView()
-        view.texels = wp.array(texels.reshape(-1, 4), dtype=wp.vec4, device=device)
-        view.resolution = resolution
-        view.extent = wp.vec3(*extent)
-        view.inv_extent = wp.vec3(*(1.0 / extent))
-        view.inner_radius = inner
-        view.outer_radius = outer
-        view.least_curvature = float(extent.min() / extent.max() ** 2)
-        return cls(texels, unit_from_body, extent, inner, outer, view)
+        return _draw(cls, points, faces, normals, body.centre, body.axes, body.extent, resolution, polish, device)
+
+    @classmethod
+    def from_sheet(cls, points, faces, sheet: Sheet, resolution: int = 128, *, normals=None, polish=None, device="cpu"):
+        """Draw the maps of an open mesh's convex companion; the mask says which nodes lie on the mesh itself.
+
+        A point has a reflection on an open convex mesh if and only if its reflection on any convex body that holds the
+        mesh on its surface falls on the mesh (the path length is convex): so the closing part may have any convex shape.
+        This one continues the tangent planes of the rim, so that nothing bends there, and ends in a box.
+
+        Args:
+            points: Float [vertex_count, 3].
+            faces: Int [triangle_count, 3], counter-clockwise seen from the front.
+            sheet: From `bodies.fit_sheet`; with `inner` the companion lies in front, and the normals point away from it.
+            resolution: Nodes along a cube edge.
+            normals: As for `from_mesh`.
+            polish: As for `from_mesh`.
+            device: Warp device of the view.
+
+        Raises:
+            ValueError: The sheet is not star-shaped about its centre.
+        """
+        points = np.asarray(points, np.float64)
+        faces = np.asarray(faces, np.int32)
+        if sheet.cosine <= 0.0:
+            raise ValueError("faces: not star-shaped: a ray from the centre meets the sheet from its front")
+        normals = _smooth_normals(points, faces) if normals is None else np.asarray(normals, np.float64)
+        if sheet.inner:
+            faces, normals = faces[:, [0, 2, 1]], -normals[:, [0, 2, 1]]
+        rim = _rim(points, faces, normals)
+        return _draw(
+            cls, points, faces, normals, sheet.centre, sheet.axes, sheet.extent, resolution, polish, device, rim
+        )
+
+
+def _draw(cls, points, faces, normals, centre, axes, extent, resolution, polish, device, rim=None) -> ReflectorMap:
+    """The maps of a body; `rim` (points, normals) is where an open one's companion begins, None of a closed one."""
+    scale = 1.0 / float(extent.max())
+    unit_from_body = np.eye(4)
+    unit_from_body[:3, :3] = scale * axes
+    unit_from_body[:3, 3] = -unit_from_body[:3, :3] @ centre
+    local = points @ unit_from_body[:3, :3].T + unit_from_body[:3, 3]
+    extent = extent * scale
+    normals = _smooth_normals(local, faces) if normals is None else np.asarray(normals, np.float64) @ axes.T
+    cube = node_directions(resolution)
+    directions = cube * extent
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    directions = directions.reshape(-1, 3)
+    triangle = _draw_faces((local / extent).astype(np.float32), faces, resolution, closed=rim is None)
+    covered = triangle >= 0
+    position, normal = np.zeros_like(directions), np.zeros_like(directions)
+    position[covered], normal[covered] = _surface_along(
+        local, faces, normals, triangle[covered], directions[covered], smooth=polish is None
+    )
+    if polish is not None:
+        distance = np.linalg.norm(position[covered], axis=1) / scale
+        distance, body_normal = polish(triangle[covered], centre, directions[covered] @ axes, distance)
+        position[covered] = directions[covered] * (distance * scale)[:, None]
+        # Outwards from the centre, whatever side the surface is seen from.
+        analytic = np.linalg.norm(body_normal, axis=1) > 0.5
+        kept = normal[covered]
+        kept[analytic] = body_normal[analytic] @ axes.T
+        normal[covered] = kept
+    heights = []
+    if rim is not None:
+        rim_points = rim[0] @ unit_from_body[:3, :3].T + unit_from_body[:3, 3]
+        rim_normals = rim[1] @ axes.T
+        position[~covered], normal[~covered] = _close(directions[~covered], rim_points, rim_normals, extent)
+        heights = [_whitened_heights(rim_points, rim_normals, extent)]
+    texels = np.zeros((FACE_COUNT, resolution, resolution, 8), np.float32)
+    texels[..., 0:3] = position.reshape(cube.shape)
+    texels[..., 3] = covered.reshape(cube.shape[:-1])
+    texels[..., 4:7] = normal.reshape(cube.shape)
+    inner, outer = _whitened_radii(local / extent, faces, position / extent, heights)
+    view = ReflectorMapView()
+    view.texels = wp.array(texels.reshape(-1, 4), dtype=wp.vec4, device=device)
+    view.resolution = resolution
+    view.extent = wp.vec3(*extent)
+    view.inv_extent = wp.vec3(*(1.0 / extent))
+    view.inner_radius = inner
+    view.outer_radius = outer
+    view.least_curvature = float(extent.min() / extent.max() ** 2)
+    view.greatest_curvature = float(extent.max() / extent.min() ** 2)
+    return cls(texels, unit_from_body, extent, inner, outer, view)
+
+
+RIM_PLANES = 160  # at most so many tangent planes close an open reflector
+PLANE_COS_MIN = 1.0e-6  # of a ray and a plane's normal below which they do not meet
+
+
+def _rim(points: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points of a sheet's border and its unit normals there, [k, 3] each."""
+    welded = weld(points, faces)
+    start, end = welded.reshape(-1), welded[:, [1, 2, 0]].reshape(-1)
+    base = int(welded.max()) + 1
+    border = ~np.isin(start * base + end, end * base + start)
+    corner = np.flatnonzero(border)
+    corner = corner[np.unique(start[corner], return_index=True)[1]]
+    corner = corner[np.unique(np.linspace(0, len(corner) - 1, min(len(corner), RIM_PLANES)).astype(np.int64))]
+    return points[faces.reshape(-1)[corner]], normals.reshape(-1, 3)[corner]
+
+
+def _close(directions, rim_points, rim_normals, extent) -> tuple[np.ndarray, np.ndarray]:
+    """Where rays from 0 leave the companion: the nearest of the rim's tangent planes and the sides of the box."""
+    sides = np.concatenate([np.eye(3), -np.eye(3)])
+    planes = np.concatenate([rim_normals, sides])
+    heights = np.concatenate([np.einsum("ij,ij->i", rim_normals, rim_points), extent, extent])
+    planes, heights = planes[heights > 0.0], heights[heights > 0.0]
+    position, normal = np.empty_like(directions), np.empty_like(directions)
+    for first in range(0, len(directions), 8192):
+        block = slice(first, first + 8192)
+        towards = directions[block] @ planes.T
+        distance = np.where(towards > PLANE_COS_MIN, heights / np.maximum(towards, PLANE_COS_MIN), np.inf)
+        nearest = distance.argmin(axis=1)
+        position[block] = directions[block] * distance[np.arange(len(nearest)), nearest][:, None]
+        normal[block] = planes[nearest]
+    return position, normal
 
 
 def _smooth_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -190,8 +279,8 @@ def _smooth_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return vertex[faces]
 
 
-def _draw_faces(whitened: np.ndarray, faces: np.ndarray, resolution: int) -> np.ndarray:
-    """Triangle seen from the centre at every node, int [6 n n], by the rasteriser: pixel centres are the nodes."""
+def _draw_faces(whitened: np.ndarray, faces: np.ndarray, resolution: int, closed: bool) -> np.ndarray:
+    """Triangle seen from the centre at every node, int [6 n n], -1 none; pixel centres of the rasteriser are the nodes."""
     n = resolution
     half = 0.5 * (n - 1)
     triangles = wp.array(faces, dtype=wp.vec3i, device="cpu")
@@ -217,7 +306,8 @@ def _draw_faces(whitened: np.ndarray, faces: np.ndarray, resolution: int) -> np.
         drawn = wp.empty(n * n, dtype=int, device="cpu")
         launch(resolve_kernel, n * n, [target.key, drawn, wp.empty(n * n, dtype=float, device="cpu")], "cpu")
         result[face] = drawn.numpy()
-    return _fill_gaps(result.reshape(FACE_COUNT, n, n)).reshape(-1)
+    drawn = result.reshape(FACE_COUNT, n, n)
+    return (_fill_gaps(drawn) if closed else drawn).reshape(-1)
 
 
 def _fill_gaps(triangle: np.ndarray) -> np.ndarray:
@@ -233,8 +323,12 @@ def _fill_gaps(triangle: np.ndarray) -> np.ndarray:
     return triangle
 
 
-def _surface_along(points, faces, normals, triangle, directions) -> tuple[np.ndarray, np.ndarray]:
-    """Point and interpolated unit normal where the rays from 0 meet the given triangles' planes."""
+def _surface_along(points, faces, normals, triangle, directions, smooth) -> tuple[np.ndarray, np.ndarray]:
+    """Point and interpolated unit normal where the rays from 0 meet the given triangles' planes.
+
+    With `smooth` the points are moved along their rays onto the surface that the corner normals describe: half the way
+    to Phong's (Boubekeur and Alexa, "Phong Tessellation", 2008), which reproduces the sagitta k h^2 / 8 of an edge.
+    """
     corner = points[faces[triangle]]
     a, b, c = corner[:, 0], corner[:, 1], corner[:, 2]
     weights = np.stack([np.einsum("ij,ij->i", directions, np.cross(p, q)) for p, q in ((b, c), (c, a), (a, b))], axis=1)
@@ -244,10 +338,29 @@ def _surface_along(points, faces, normals, triangle, directions) -> tuple[np.nda
     distance = np.einsum("ij,ij->i", facet, a) / np.einsum("ij,ij->i", facet, directions)
     normal = np.einsum("ik,ikj->ij", weights, normals[triangle])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1.0e-300)
-    return directions * distance[:, None], normal
+    position = directions * distance[:, None]
+    if smooth:
+        tangent = np.zeros_like(position)
+        for k, vertex in enumerate((a, b, c)):
+            n = normals[triangle, k]
+            above = np.einsum("ij,ij->i", position - vertex, n)
+            tangent -= (weights[:, k] * above)[:, None] * n
+        along = np.einsum("ij,ij->i", directions, normal)
+        lift = np.einsum("ij,ij->i", tangent, normal) / np.where(along > PHONG_COS_MIN, along, np.inf)
+        position += PHONG_SHARE * lift[:, None] * directions
+    return position, normal
 
 
-def _whitened_radii(whitened: np.ndarray, faces: np.ndarray, nodes: np.ndarray) -> tuple[float, float]:
+PHONG_SHARE = 0.5
+PHONG_COS_MIN = 0.05  # of a ray and the normal; a grazing ray would be moved too far along itself
+
+
+def _whitened_heights(points: np.ndarray, normals: np.ndarray, extent: np.ndarray) -> np.ndarray:
+    """Distances of planes from the centre in whitened space."""
+    return np.einsum("ij,ij->i", points, normals) / np.maximum(np.linalg.norm(normals * extent, axis=1), 1.0e-300)
+
+
+def _whitened_radii(whitened, faces: np.ndarray, nodes: np.ndarray, others: list) -> tuple[float, float]:
     """Radii of a ball inside and a ball around the convex body in whitened space, with a margin for float32."""
     corner = whitened[faces]
     facet = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
@@ -257,4 +370,5 @@ def _whitened_radii(whitened: np.ndarray, faces: np.ndarray, nodes: np.ndarray) 
     outer = max(
         float(np.linalg.norm(whitened[faces.reshape(-1)], axis=1).max()), float(np.linalg.norm(nodes, axis=1).max())
     )
-    return float(height.min()) * (1.0 - 1.0e-5), outer * (1.0 + 1.0e-5)
+    inner = max(float(np.concatenate([height, *others]).min()), 0.0)
+    return inner * (1.0 - 1.0e-5), outer * (1.0 + 1.0e-5)
