@@ -8,7 +8,6 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade
 from warp_reflect.images import write_exr, write_png
 from warp_reflect.stage.lights import latlong
 from warp_reflect.stage.read import read_stage
-from warp_reflect.stage.reflectors import override_reflectors
 from warp_reflect.stage.textures import unpacked
 
 TYPES = Sdf.ValueTypeNames
@@ -228,68 +227,6 @@ def test_what_is_not_simulated_is_noted(stage):
     material = samples.add_material(stage, "/M", opacityThreshold=0.5)
     samples.bind(samples.add_quad(stage, "/Quad"), material)
     assert any("/M: inputs:opacityThreshold is not used" in text for text in texts(read_stage(samples.saved(stage))))
-
-
-def mirrors(data):
-    return {
-        i.prim_path + ":" + str(k)
-        for i in data.instances
-        for k, m in enumerate(i.materials)
-        if data.materials[m].metallic == 1.0
-    }
-
-
-@pytest.fixture
-def garage(stage):
-    for path in ("/World/Car/Body", "/World/Car/Wheel", "/World/Wall"):
-        samples.add_cube_mesh(stage, path)
-    paint = samples.add_material(stage, "/Looks/Paint", diffuseColor=(0.8, 0.1, 0.1), useSpecularWorkflow=1)
-    samples.bind(stage.GetPrimAtPath("/World/Car/Body"), paint)
-    subset = UsdShade.MaterialBindingAPI(stage.GetPrimAtPath("/World/Car/Body")).CreateMaterialBindSubset(
-        "window", [0], "face"
-    )
-    samples.bind(subset, samples.add_material(stage, "/Looks/Glass"))
-    collection = Usd.CollectionAPI.Apply(stage.GetPrimAtPath("/World"), "shiny")
-    collection.IncludePath("/World/Wall")
-    return samples.saved(stage)
-
-
-@pytest.mark.parametrize(
-    ("pattern", "expected"),
-    [
-        ("/World/Wall", {"/World/Wall:0"}),
-        ("/World/Car", {"/World/Car/Body:0", "/World/Car/Body:1", "/World/Car/Wheel:0"}),
-        ("/World/*/Wheel", {"/World/Car/Wheel:0"}),
-        ("W*l", {"/World/Car/Wheel:0", "/World/Wall:0"}),
-        ("/Looks/Paint", {"/World/Car/Body:0"}),
-        ("/World/Car/Body/window", {"/World/Car/Body:1"}),
-        ("/World.collection:shiny", {"/World/Wall:0"}),
-    ],
-)
-def test_mirrors_can_be_named(garage, pattern, expected):
-    data = read_stage(garage)
-    assert not mirrors(data)
-    assert override_reflectors(data, pattern, roughness=0.01) == len(expected)
-    assert mirrors(data) == expected
-    chosen = [m for m in data.materials if m.metallic == 1.0]
-    assert all(m.roughness == 0.01 and not m.specular_workflow for m in chosen)
-    assert mirrors(read_stage(garage, reflectors=(pattern,))) == expected
-
-
-def test_a_mirror_that_is_not_there_is_named_with_its_nearest(garage):
-    with pytest.raises(ValueError, match=r"'/World/Wal'.*nearest: .*/World/Wall"):
-        override_reflectors(read_stage(garage), "/World/Wal")
-
-
-def test_point_instances_can_be_named(stage):
-    instancer = UsdGeom.PointInstancer.Define(stage, "/PI")
-    instancer.CreatePrototypesRel().SetTargets(["/PI/Ball"])
-    instancer.CreateProtoIndicesAttr([0, 0])
-    instancer.CreatePositionsAttr([Gf.Vec3f(0, 0, 0), Gf.Vec3f(3, 0, 0)])
-    UsdGeom.Sphere.Define(stage, "/PI/Ball")
-    data = read_stage(samples.saved(stage))
-    assert override_reflectors(data, "/PI:1") == 1
-    assert [data.materials[i.materials[0]].metallic for i in data.instances] == [0.0, 1.0]
 
 
 def test_shape_lights_carry_their_radiance(stage):

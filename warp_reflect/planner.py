@@ -190,10 +190,12 @@ def find_camera(scene: Scene, camera: str | Camera | None, size: tuple[int, int]
 
 
 def mirror_weight(scene: Scene, part: PartRange, settings: Settings) -> float:
-    """Luminance of a part's mirror term at normal incidence; 0 where its material is not a mirror by the settings."""
+    """Luminance of a part's mirror term at normal incidence; 0 where it is no mirror, by choice or by the settings."""
     material = scene.data.materials[part.material]
     f0, _ = reflectance(material)
     weight = float(f0 @ REC709_LUMINANCE)
+    if material.mirror is not None:
+        return weight if material.mirror.include else 0.0
     coated = material.clearcoat >= CLEARCOAT_MIN and material.clearcoat_roughness <= settings.reflector_max_roughness
     if coated:
         return max(weight, CLEARCOAT_MIN)
@@ -240,7 +242,7 @@ def _row(scene, camera, settings, method, number, part_index, part, weight, pixe
         forced,
         reason,
         pixels,
-        _effects(scene, technique, pixels, weight, settings),
+        _effects(scene, part, technique, pixels, weight, settings),
         settings,
         predicted,
     )
@@ -250,6 +252,13 @@ def _technique(scene, reflector, camera, method, pixels, settings, part, notes) 
     """(technique, forced, reason) of a reflector."""
     if method == "reference":
         return "raytraced", True, "the reference: every mirror is traced"
+    mirror = scene.data.materials[part.material].mirror
+    if method == "auto" and mirror is not None and mirror.technique != "auto":
+        if mirror.technique in TECHNIQUES:
+            method = mirror.technique
+        else:
+            known = ", ".join(TECHNIQUES)
+            notes.append(Note(part.prim_path, f"technique: got '{mirror.technique}', expected auto or one of {known}"))
     if method != "auto":
         applies, reason = _applies(scene, reflector, camera, method)
         if applies:
@@ -281,13 +290,15 @@ def _applies(scene, reflector, camera: Camera, method: str) -> tuple[bool, str]:
     return TECHNIQUES[method].applies(scene, reflector)
 
 
-def _effects(scene, technique, pixels, weight, settings) -> dict[str, Effect]:
+def _effects(scene, part, technique, pixels, weight, settings) -> dict[str, Effect]:
     traced = technique == "raytraced"
     visible = pixels > 0
+    chosen = scene.data.materials[part.material].mirror is not None
+    bound = "chosen by name" if chosen else f">= {settings.reflector_min_weight} (reflector_min_weight)"
     return {
         "reflection": Effect(
             visible,
-            f"mirror weight {weight:.2f} >= {settings.reflector_min_weight} (reflector_min_weight), {pixels} pixels"
+            f"mirror weight {weight:.2f} {bound}, {pixels} pixels"
             if visible
             else "not seen from the camera",
             {"weight": weight, "pixels": pixels},

@@ -109,6 +109,31 @@ class TextureRef:
 
 
 @dataclass(frozen=True)
+class MirrorData:
+    """What the user asks of a surface as a mirror: on the stage (`WarpReflectMirrorAPI`), or by naming it.
+
+    The material it asks for is in the `MaterialData` that holds this.
+    """
+
+    path: str  # the prim with the API, or the pattern
+    include: bool = True  # False: never a mirror
+    technique: str = "auto"  # as authored: not checked
+    map_file: str = ""  # a baked reflector map, resolved; empty: none
+    map_layout: str = ""
+    reflects: tuple[str, ...] | None = None  # prims that are seen in it, with all below; None: everything
+
+
+@dataclass(frozen=True)
+class EnvironmentMapData:
+    """The place of a reference environment map (`WarpReflectEnvironmentMapAPI`)."""
+
+    path: str
+    world_from_map: np.ndarray  # float64 [4, 4]; the eye is the origin
+    map_file: str = ""  # resolved; empty: to be rendered
+    map_layout: str = ""
+
+
+@dataclass(frozen=True)
 class MaterialData:
     """UsdPreviewSurface parameters; colours linear Rec.709.
 
@@ -129,6 +154,7 @@ class MaterialData:
     clearcoat_roughness: float = 0.01
     uses_vertex_color: bool = False  # base_color is replaced by MeshData.colors
     textures: dict[str, TextureRef] = field(default_factory=dict)  # by field name: "base_color", "roughness" ...
+    mirror: MirrorData | None = None  # None: its values decide whether it is a mirror
 
 
 @dataclass(frozen=True)
@@ -177,6 +203,7 @@ class SceneData:
     time_range: tuple[float, float] | None = None
     time_codes_per_second: float = 24.0
     collections: dict[str, tuple[str, ...]] = field(default_factory=dict)  # "/Prim.collection:name" to member paths
+    environment_maps: list[EnvironmentMapData] = field(default_factory=list)
     # Textures that were read with the stage, by `textures.picture_key`, float32 [h, w, 1 or 3]; None: read from files
     # when they are needed.
     pictures: dict[str, np.ndarray] | None = None

@@ -14,7 +14,7 @@ from warp_reflect.stage.detail import pixels_across, subdivision_level
 from warp_reflect.stage.geometry import SMOOTH_SCHEMES, read_gprim, read_mesh, subdivision_scheme
 from warp_reflect.stage.intake import BadPrim, Intake, floats, library_message, transform_fault
 from warp_reflect.stage.materials import MaterialTable, Surface
-from warp_reflect.stage.reflectors import matches, may_reflect, part_names
+from warp_reflect.stage.reflectors import Choices, may_reflect, part_names
 
 DISPLAY_COLOR = "displayColor"
 Box = tuple[np.ndarray, np.ndarray]
@@ -36,13 +36,13 @@ class Assembly:
     Attributes:
         intake: The reading.
         level: 0: every mesh gets the detail it needs; 1 to 3: all get this level.
-        reflectors: Patterns of what the user calls a mirror.
+        choices: What the user calls a mirror.
         static: Meshes of earlier readings, by what they depend on; filled here.
     """
 
     intake: Intake
     level: int
-    reflectors: tuple[str, ...]
+    choices: Choices
     static: dict[tuple, MeshEntry]
     meshes: list[MeshData] = field(default_factory=list)
 
@@ -90,7 +90,7 @@ class Assembly:
             prim, found = drawn[members[key][0]], [surfaces[i] for i in members[key]]
             level = self.level
             if level == 0 and key in boxes:
-                mirror = any(self._is_mirror(drawn[i], surfaces[i], data) for i in members[key])
+                mirror = any(self._is_mirror(drawn[i], surfaces[i]) for i in members[key])
                 level = self._level(prim, boxes[key], stacks[key], mirror, data.cameras[0])
             entries[key] = self._entry(key, prim, found, level)
 
@@ -167,13 +167,11 @@ class Assembly:
         counts = UsdGeom.Mesh(prim).GetFaceVertexCountsAttr().Get(self.intake.time)
         return subdivision_level(len(counts or ()), mirror, pixels_across(*box, worlds, camera))
 
-    def _is_mirror(self, prim, surfaces: list[Surface | None], data: SceneData) -> bool:
+    def _is_mirror(self, prim, surfaces: list[Surface | None]) -> bool:
         for target, surface in zip(targets(prim), surfaces, strict=True):
-            if surface is not None and may_reflect(surface.data):
-                return True
             subset = "" if target == prim else target.GetName()
-            names = part_names(str(prim.GetPath()), subset, "", surface.data.path if surface else "")
-            if any(matches(pattern, names, data.collections) for pattern in self.reflectors):
+            choice = self.choices.of(part_names(str(prim.GetPath()), subset, "", surface.data.path if surface else ""))
+            if choice.mirror.include if choice else surface is not None and may_reflect(surface.data):
                 return True
         return False
 

@@ -32,7 +32,7 @@ def load_stage(
         complexity: "low", "medium", "high" or "veryhigh": subdivision and tessellation of gprims.
         strict: Raise for a prim that would be dropped or repaired with a note.
         reflectors: Patterns of prims, materials or collections that get a mirror's material, whatever the
-            stage says; see `override_reflectors`.
+            stage says, as "/World/Car*:color=keep"; see `reflectors.parse_patterns`.
         untrusted: Read in a child process with bounded memory and time, confined to `root` or, where it is empty, to
             the stage's folder.
         root: Folder that layers and pictures must lie in; empty: anywhere, unless untrusted.

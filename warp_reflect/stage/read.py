@@ -20,7 +20,8 @@ from pxr import Sdf, Tf, Usd, UsdGeom, UsdUtils  # isort: skip
 
 from warp_reflect.stage.assemble import Assembly, MeshEntry
 from warp_reflect.stage.lights import SHADED_KINDS, default_dome
-from warp_reflect.stage.reflectors import override_reflectors
+from warp_reflect.stage.reflectors import Choices, choose_reflectors, parse_patterns
+from warp_reflect.stage.schema import register
 from warp_reflect.stage.walk import State, Walk
 
 PURPOSES = ("default", "render", "proxy", "guide")
@@ -49,7 +50,7 @@ def read_stage(
             it needs (`detail.subdivision_level`), the others all to level 1, 2 or 3.
         strict: Raise what would be dropped or repaired with a note.
         limits: What is refused for its size.
-        reflectors: Patterns of prims that get a mirror's material; see `override_reflectors`.
+        reflectors: Patterns of prims that get a mirror's material; see `reflectors.parse_patterns`.
 
     Raises:
         FileNotFoundError: no such file.
@@ -85,7 +86,7 @@ class StageReader:
         self.purposes = frozenset(purposes) | {"default"}
         self.level = COMPLEXITIES.index(complexity)
         self.strict = strict
-        self.reflectors = (reflectors,) if isinstance(reflectors, str) else tuple(reflectors)
+        self.patterns = parse_patterns(reflectors)
         self.limits = limits or Limits()
         self.stage = open_stage(self.path, self.limits)
         self._static: dict[tuple, MeshEntry] = {}
@@ -105,8 +106,6 @@ class StageReader:
                 data = self._read(time, intake)
         except Tf.ErrorException as fault:
             raise ValueError(f"cannot read {self.path}: {library_message(fault)}") from None
-        if self.reflectors:
-            override_reflectors(data, self.reflectors)
         data.notes = intake.notes
         self._first = self._first or data
         return data
@@ -127,10 +126,13 @@ class StageReader:
         data = self._metadata(time, intake)
         for error in self.stage.GetCompositionErrors():
             intake.bad(error.rootSite.path, f"composition: {' '.join(str(error).split())}")
-        walk = Walk(self.stage, intake, self.purposes, self.path, data.up_axis)
+        choices = Choices(self.patterns, {}, data.collections)
+        walk = Walk(self.stage, intake, self.purposes, self.path, data.up_axis, choices)
         placed = walk.below(self.stage.GetPseudoRoot(), State(np.eye(4)), Usd.PrimDefaultPredicate)
         data.lights, data.cameras = walk.lights, self._primary_first(walk.cameras)
-        Assembly(intake, self.level, self.reflectors, self._static).complete(data, walk.drawn, placed)
+        data.environment_maps = walk.environment_maps
+        Assembly(intake, self.level, choices, self._static).complete(data, walk.drawn, placed)
+        choose_reflectors(data, choices)
         if not data.instances:
             intake.note("/", "the stage holds no geometry that can be drawn")
         if not any(light.kind in SHADED_KINDS for light in data.lights):
@@ -151,7 +153,8 @@ class StageReader:
                 continue
             for collection in Usd.CollectionAPI.GetAll(prim):
                 name = collection.GetName()
-                if name in LINK_COLLECTIONS or not collection.GetIncludesRel().HasAuthoredTargets():
+                whole = collection.GetIncludeRootAttr().Get()
+                if name in LINK_COLLECTIONS or not (whole or collection.GetIncludesRel().HasAuthoredTargets()):
                     continue
                 members = Usd.CollectionAPI.ComputeIncludedPaths(
                     collection.ComputeMembershipQuery(),
@@ -202,6 +205,7 @@ def open_stage(path: str, limits: Limits) -> Usd.Stage:
     """
     check_file(path, limits)
     with quiet():
+        register()
         try:
             known = Sdf.Layer.Find(path)
             stage = Usd.Stage.Open(path, Usd.Stage.LoadAll)

@@ -1,33 +1,123 @@
-"""Mirrors by name: the user's word over what the materials say."""
+"""Mirrors by choice: the word of the user, on the stage or by name, over what the materials say."""
 
 from __future__ import annotations
 
 import dataclasses
 import difflib
+import re
+from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 
 import numpy as np
 
-from warp_reflect.scene import MaterialData, SceneData, reflectance
+from warp_reflect.scene import MaterialData, MirrorData, SceneData, reflectance
 from warp_reflect.settings import Settings
 
-OVERRIDDEN = ("metallic", "roughness")
-CHROME = (0.55, 0.556, 0.554)  # normal reflectance of polished chromium, linear Rec. 709
-REC709_LUMINANCE = (0.2126, 0.7152, 0.0722)
+# A metal as a mirror's maker would have it: silver-like, without a tint of its own.
+NEUTRAL_METALLIC, NEUTRAL_ROUGHNESS, NEUTRAL_COLOR = 1.0, 0.0, (0.9, 0.9, 0.9)
+KEEP = "keep"  # as a colour: the material's own
+OPTIONS = ("metallic", "roughness", "color", "technique")
+CLEARCOAT_MIN = 0.5  # a coat from here on is a mirror, whatever lies below it
+_OPTION = re.compile(r":(\w+)=([^:]*)$")
 
 
-def override_reflectors(
-    data: SceneData, patterns: tuple[str, ...] | str, metallic: float = 1.0, roughness: float = 0.0
-) -> int:
-    """Give what the patterns name a reflective material; the stage itself is not touched.
+@dataclass(frozen=True)
+class Choice:
+    """A mirror the user chose, and the material it gets.
+
+    Attributes:
+        mirror: Where it was asked for, and what else was.
+        metallic: None: the material's own where that is a mirror already, else `NEUTRAL_METALLIC`.
+        roughness: Likewise.
+        color: Linear Rec.709; `KEEP`: the material's own; None: likewise.
+    """
+
+    mirror: MirrorData
+    metallic: float | None = None
+    roughness: float | None = None
+    color: tuple[float, float, float] | str | None = None
+
+
+@dataclass
+class Choices:
+    """All mirrors that were chosen for one reading.
+
+    Attributes:
+        patterns: By name; the last that matches decides, before any prim.
+        prims: By the path of the prim that carries the schema; the nearest above decides.
+        collections: Member paths by "/Prim.collection:name".
+        matched: Patterns that named something so far.
+    """
+
+    patterns: dict[str, Choice] = field(default_factory=dict)
+    prims: dict[str, Choice] = field(default_factory=dict)
+    collections: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    matched: set[str] = field(default_factory=set)
+
+    def of(self, names: tuple[str, ...]) -> Choice | None:
+        """What was chosen for the part that has these names, `part_names`; None: nothing."""
+        chosen = None
+        for pattern, choice in self.patterns.items():
+            if matches(pattern, names, self.collections):
+                self.matched.add(pattern)
+                chosen = choice
+        if chosen is None and self.prims:
+            above = {path for name in names for path in _ancestors(name)} & self.prims.keys()
+            if above:
+                chosen = self.prims[max(above, key=lambda path: path.count("/"))]
+        return chosen
+
+
+def parse_patterns(texts: tuple[str, ...] | str) -> dict[str, Choice]:
+    """Patterns with what their mirrors shall be: "PATTERN[:metallic=M][:roughness=R][:color=C][:technique=T]".
+
+    A pattern is the path or glob of a prim (with all below it), of a GeomSubset, of a point instance or of a
+    material; a name or glob without "/" (any prim of that name); or a collection, "/Prim.collection:name". It becomes
+    a mirror of metallic 1, roughness 0 and a neutral grey of 0.9, but for the options. A colour is one number or
+    three, linear Rec.709, "0.9,0.6,0.5", or "keep", the material's own, texture included.
+
+    Raises:
+        ValueError: an option that is unknown or has an impossible value.
+    """
+    found = {}
+    for text in (texts,) if isinstance(texts, str) else texts:
+        pattern, options = text, {}
+        while option := _OPTION.search(pattern):
+            name, value = option.groups()
+            if name not in OPTIONS:
+                near = difflib.get_close_matches(name, OPTIONS, n=3, cutoff=0.3) or OPTIONS
+                raise ValueError(f"reflector '{text}': unknown option '{name}'; nearest: {', '.join(near)}")
+            options.setdefault(name, value)
+            pattern = pattern[: option.start()]
+        color = options.get("color", "")
+        found[pattern] = Choice(
+            MirrorData(pattern, technique=options.get("technique", "auto")),
+            *(
+                _numbers(text, name, options[name], 1)[0] if name in options else neutral
+                for name, neutral in (("metallic", NEUTRAL_METALLIC), ("roughness", NEUTRAL_ROUGHNESS))
+            ),
+            KEEP if color == KEEP else _numbers(text, "color", color, 3) if color else NEUTRAL_COLOR,
+        )
+    return found
+
+
+def _numbers(text: str, name: str, value: str, width: int) -> tuple[float, ...]:
+    try:
+        numbers = [float(piece) for piece in value.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in (1, width) or not all(0.0 <= each <= 1.0 for each in numbers):
+        expected = "a number from 0 to 1" if width == 1 else f"one or {width} numbers from 0 to 1, or {KEEP}"
+        raise ValueError(f"reflector '{text}': {name}: got '{value}', expected {expected}")
+    return tuple(numbers) if len(numbers) == width else (numbers[0],) * width
+
+
+def choose_reflectors(data: SceneData, choices: Choices) -> int:
+    """Give what was chosen a reflective material; the stage itself is not touched.
 
     Args:
         data: Changed in place: new materials are appended, instances point to them.
-        patterns: Each the path or glob of a prim (with all below it), of a GeomSubset, of a point instance
-            or of a material; a name or glob without "/" (any prim of that name); or a collection,
-            "/Prim.collection:name".
-        metallic: The material's new value; 1 reflects with its base colour.
-        roughness: The material's new value.
+        choices: What was chosen.
 
     Returns:
         Parts (prim instances times material subsets) changed.
@@ -35,24 +125,24 @@ def override_reflectors(
     Raises:
         ValueError: a pattern that names nothing that is drawn; with the nearest names.
     """
-    patterns = (patterns,) if isinstance(patterns, str) else tuple(patterns)
-    unused, replaced, changed = set(patterns), {}, 0
+    replaced: dict[tuple[int, int], int] = {}
+    changed = 0
     for instance in data.instances:
         parts = data.meshes[instance.mesh].parts
         materials = list(instance.materials)
         for k, index in enumerate(instance.materials):
             subset = parts[k].subset if parts else ""
-            names = part_names(instance.prim_path, subset, instance.instance, data.materials[index].path)
-            hits = [p for p in patterns if matches(p, names, data.collections)]
-            if not hits:
+            choice = choices.of(part_names(instance.prim_path, subset, instance.instance, data.materials[index].path))
+            if choice is None:
                 continue
-            unused.difference_update(hits)
-            if index not in replaced:
-                replaced[index] = len(data.materials)
-                data.materials.append(mirrored(data.materials[index], metallic, roughness))
-            materials[k] = replaced[index]
+            key = index, id(choice)
+            if key not in replaced:
+                replaced[key] = len(data.materials)
+                data.materials.append(mirrored(data.materials[index], choice))
+            materials[k] = replaced[key]
             changed += 1
         instance.materials = tuple(materials)
+    unused = [pattern for pattern in choices.patterns if pattern not in choices.matched]
     if unused:
         pattern = min(unused)
         known = {name for i in data.instances for name in (i.prim_path, i.prim_path.rpartition("/")[2])}
@@ -93,25 +183,29 @@ def _below(path: str, name: str) -> bool:
     return fnmatchcase(name, path) or name.startswith(f"{path}/")
 
 
-def mirrored(material: MaterialData, metallic: float, roughness: float) -> MaterialData:
-    """The material with another metallic and roughness, constant, in the metallic workflow.
+def _ancestors(path: str) -> list[str]:
+    """A path and all paths above it."""
+    found = [path]
+    while path := path.rpartition("/")[0]:
+        found.append(path)
+    return found
 
-    A metal reflects with its base colour. Where that is too dark to count as a mirror's, or is only the
-    fallback of what has no material, the mirror is chrome: who names a mirror wants to see one.
-    """
-    dropped, base = set(OVERRIDDEN), material.base_color
-    unnamed = not material.path and not material.uses_vertex_color
-    if unnamed or float(np.dot(base, REC709_LUMINANCE)) < Settings().reflector_min_weight:
-        base = CHROME
-        dropped.add("base_color")
-    return dataclasses.replace(
-        material,
-        base_color=base,
-        metallic=metallic,
-        roughness=roughness,
-        specular_workflow=False,
-        textures={name: ref for name, ref in material.textures.items() if name not in dropped},
-    )
+
+def mirrored(material: MaterialData, choice: Choice) -> MaterialData:
+    """The material that a choice makes of another: constants in the metallic workflow where it says so."""
+    if not choice.mirror.include:
+        return dataclasses.replace(material, mirror=choice.mirror)
+    values = {"metallic": choice.metallic, "roughness": choice.roughness, "base_color": choice.color}
+    if not may_reflect(material):
+        neutral = {"metallic": NEUTRAL_METALLIC, "roughness": NEUTRAL_ROUGHNESS, "base_color": NEUTRAL_COLOR}
+        values = {name: neutral[name] if value is None else value for name, value in values.items()}
+    values = {name: value for name, value in values.items() if value is not None and value != KEEP}
+    if "base_color" in values:
+        values["uses_vertex_color"] = False
+    if "metallic" in values or "base_color" in values:
+        values["specular_workflow"] = False
+    textures = {name: texture for name, texture in material.textures.items() if name not in values}
+    return dataclasses.replace(material, **values, textures=textures, mirror=choice.mirror)
 
 
 def may_reflect(material: MaterialData) -> bool:
@@ -125,6 +219,3 @@ def may_reflect(material: MaterialData) -> bool:
         best = dataclasses.replace(best, base_color=(1.0, 1.0, 1.0))
     weight = float(reflectance(best)[0].max())
     return roughness <= defaults.reflector_max_roughness and weight >= defaults.reflector_min_weight
-
-
-CLEARCOAT_MIN = 0.5  # a coat from here on is a mirror, whatever lies below it

@@ -7,11 +7,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from pxr import Tf, Usd, UsdGeom
 
-from warp_reflect.scene import CameraData, InstanceData, LightData
+from warp_reflect.scene import CameraData, EnvironmentMapData, InstanceData, LightData
 from warp_reflect.stage.cameras import read_camera
 from warp_reflect.stage.instancer import expand, read_instancer
 from warp_reflect.stage.intake import BadPrim, Intake, column_matrix, library_message
 from warp_reflect.stage.lights import read_light
+from warp_reflect.stage.reflectors import Choices
+from warp_reflect.stage.schema import ENVIRONMENT_MAP_API, MIRROR_API, applied, read_environment_map, read_mirror
 
 ANALYTIC = frozenset(("Sphere", "Cube", "Cylinder", "Cylinder_1", "Cone", "Capsule", "Capsule_1", "Plane"))
 
@@ -33,7 +35,7 @@ class Walk:
     Attributes:
         drawn: The prims that are drawn, each once; what `below` returns has its index here as `mesh`, and no
             materials yet.
-        lights, cameras: What was met of them.
+        lights, cameras, environment_maps: What was met of them; mirrors are added to `choices`.
     """
 
     stage: Usd.Stage
@@ -41,9 +43,11 @@ class Walk:
     purposes: frozenset[str]
     source: str
     up_axis: str
+    choices: Choices
     drawn: list = field(default_factory=list)
     lights: list[LightData] = field(default_factory=list)
     cameras: list[CameraData] = field(default_factory=list)
+    environment_maps: list[EnvironmentMapData] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self._drawn_index: dict[str, int] = {}
@@ -118,6 +122,13 @@ class Walk:
                 self.intake.note(prim.GetPath(), "xformOpOrder: !resetXformStack! stops at the point instancer")
             state = State(world, visible, purpose, state.inside_instancer)
         kind = prim.GetTypeName()
+        schemas = applied(prim)
+        if MIRROR_API in schemas:
+            choice = read_mirror(prim, self.intake, self.choices.collections)
+            if choice is not None:
+                self.choices.prims[choice.mirror.path] = choice
+        if ENVIRONMENT_MAP_API in schemas and state.visible and not state.inside_instancer:
+            self._environment_map(prim, state)
         if prim.IsModel():
             self._draw_mode(prim)
         if prim.IsA(UsdGeom.Camera):
@@ -146,6 +157,12 @@ class Walk:
             self.cameras.append(read_camera(prim, state.world_from_parent, self.intake))
         except BadPrim as fault:
             self.intake.bad(prim.GetPath(), f"{fault}; camera dropped")
+
+    def _environment_map(self, prim, state: State) -> None:
+        try:
+            self.environment_maps.append(read_environment_map(prim, state.world_from_parent, self.intake))
+        except BadPrim as fault:
+            self.intake.bad(prim.GetPath(), f"{fault}; {ENVIRONMENT_MAP_API} not used")
 
     def _light(self, prim, state: State) -> None:
         if state.inside_instancer:
