@@ -152,14 +152,16 @@ def test_frames_show_the_stage_at_their_time(stage, call):
     assert rows[0] > rows[1] + 0.5 > rows[2] + 1.0  # the box rises
 
 
-def test_job_that_fails_part_way_keeps_and_names_what_is_finished(stage, call):
+def test_frame_that_fails_is_named_and_the_others_go_on(stage, call):
     Path("a.2.exr").mkdir()
     code, out, err = call("render", stage, "a.#.exr", "-f", "1:3", "-w", "40")
     assert code == 1
-    assert out.startswith("a.1.exr: ")
-    assert "error: frame 2: a.2.exr: cannot be written" in err
-    assert "kept 1 finished file: a.1.exr" in err
-    assert files() == ["a.1.exr", "a.2.exr"]
+    assert [line.split(":")[0] for line in out.splitlines()] == ["a.1.exr", "a.3.exr"]
+    assert err.splitlines() == [
+        "error: frame 2: a.2.exr: cannot be written: it exists and is not a regular file",
+        "kept 2 finished files: a.1.exr, a.3.exr",
+    ]
+    assert files() == ["a.1.exr", "a.2.exr", "a.3.exr"]
 
 
 @pytest.mark.parametrize(
@@ -190,6 +192,11 @@ def test_job_that_fails_part_way_keeps_and_names_what_is_finished(stage, call):
         (["render", "stage.usda", "a.exr", "--root", "elsewhere"], "outside the folder elsewhere"),
         (["render", "stage.usda", "a.exr", "--root", "elsewhere", "--untrusted"], "outside the folder elsewhere"),
         (["render", "stage.usda", "a.exr", "--bogus"], "--bogus"),
+        (["render", "stage.usda", "a.exr", "--progress", "bar"], "rich, json, alf, none"),
+        (["render", "stage.usda", "a.exr", "--part", "3/2"], "--part: got '3/2'"),
+        (["render", "stage.usda", "a.exr", "--workers", "0"], "--workers: got 0"),
+        (["render", "stage.usda", "a.exr", "--print-job", "slurm"], "openjd"),
+        (["render", "stage.usda", "a.#.exr", "-f", "1:4", "--strict"], "outside of its time codes 1 to 3"),
         (["plan", "stage.usda", "more.usda"], "more.usda"),
         (["compare", "none.exr", "stage.usda"], "none.exr: cannot be read: no such file"),
         (["compare", "stage.usda", "stage.usda"], "stage.usda: cannot be read"),

@@ -26,7 +26,7 @@ FLOORS = {
     3: "solve solver solve_device solve_plane solve_convex solve_map solve_general solve_qim solver_gradients mirrors "
     "reflector_maps techniques techniques.* finishes finishes.*",
     4: "planner budget frame motion sweep",
-    5: "cli viewer viewer.* pipeline",
+    5: "cli viewer viewer.* pipeline progress cluster farm",
 }
 # Where an imported library may appear, inside functions or out.
 HOMES = {
@@ -35,11 +35,12 @@ HOMES = {
     "pyvista": ("viewer",),
     "vtk": ("viewer",),
     "cyclopts": ("cli",),
-    "rich": ("cli", "viewer", "pipeline"),
+    "rich": ("viewer", "progress"),
     "matplotlib": ("sweep", "viewer"),
     "trimesh": ("stage", "techniques", "viewer", "bodies", "shapes"),
     "coacd": ("techniques", "stage"),
-    "dask": ("pipeline",),
+    "dask": (),
+    "distributed": ("cluster",),
     "scipy": (),
     "embreex": (),
     "MaterialX": ("stage",),
@@ -53,6 +54,7 @@ HEAVY = (
     "cyclopts",
     "rich",
     "matplotlib",
+    "distributed",
     "embreex",
     "scipy",
     "MaterialX",

@@ -138,7 +138,7 @@ def render_one(path: Path, picture: Path | None) -> int:
         if picture is not None:
             frame.write(picture)
     except cli.REFUSALS as error:
-        print(cli._line(error), file=sys.stderr)
+        print(cli.one_line(error), file=sys.stderr)
         return REFUSED
     numbers = {"triangles": scene.triangle_count, "mirrors": len(plan.rows), "notes": len(scene.notes + plan.notes)}
     for name in frame.keys():

@@ -1,7 +1,7 @@
 """The `warp-reflect` command: `plan`, `render`, `compare`.
 
 Results go to standard output, notes and errors to standard error. Exit 0: done; 1: a job failed part way;
-2: cannot be done, with one line that says why.
+2: cannot be done, with one line that says why; 130, 143: stopped by SIGINT, SIGTERM.
 """
 
 from __future__ import annotations
@@ -10,21 +10,18 @@ import json
 import os
 import sys
 import traceback
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
-from time import perf_counter
-from typing import Annotated
+from dataclasses import dataclass, fields, replace
+from typing import Annotated, get_type_hints
 
 import cyclopts
 from cyclopts import Parameter
 
-from warp_reflect import images
+from warp_reflect import images, pipeline
 from warp_reflect.devices import open_device as _open_device
+from warp_reflect.pipeline import DONE, IMPOSSIBLE, SIDE_MAX, Job, one_line, plan_scene
+from warp_reflect.progress import reporting
 
-DONE, PART_WAY, IMPOSSIBLE = 0, 1, 2
-NOTES_SHOWN = 40  # a stage of thousands of prims may have thousands; `plan --json` has them all
-SIDE_MAX = 32768  # pixels; what the image readers of this package accept back
+INTERRUPTED = 130  # what a shell expects of a process that SIGINT ended
 
 # What a user's input can cause; anything else is a fault of this program.
 REFUSALS = (ValueError, KeyError, OSError, NotImplementedError, MemoryError)
@@ -96,17 +93,37 @@ def plan(
     _check_method(planned.method)
     _check_size_options(planned)
     device = _open_device(opened.device)
-    with _progress() as show:
-        show("reading " + stage)
+    with reporting(None) as report:
+        report.busy("reading " + stage)
         scene = _load(stage, opened, planned, settings, device, None)
-        show("planning")
+        report.busy("planning")
         made = _make_plan(scene, planned, settings)
-    if json_:
-        print(json.dumps(made.to_json(), indent=2, allow_nan=False))
-    else:
-        print(made)
-    _print_notes([*scene.notes, *made.notes], set())
+    print(json.dumps(made.to_json(), indent=2, allow_nan=False) if json_ else made)
+    report.notes([*scene.notes, *made.notes])
     return DONE
+
+
+@Parameter(name="*")
+@dataclass
+class RangeOptions:
+    """How a range of frames is rendered."""
+
+    resume: Annotated[bool, Parameter(negative=())] = False
+    """Keep frames whose files are whole and were made from the same stage and settings; redo all others."""
+    workers: int = 1
+    """Processes that render; more than one needs the extra `cluster`. Each uses its share of the cores."""
+    scheduler: str | None = None
+    """A running dask scheduler to use instead, as tcp://host:8786."""
+    part: str | None = None
+    """Render part K of N of the frames, K/N; frames keep their neighbours in the whole range."""
+    timelimit: float | None = None
+    """Seconds after which no frame is begun, or one that would take longer than that."""
+    progress: str | None = None
+    """rich, json (one object a line on standard error), alf (ALF_PROGRESS 50%) or none; rich on a terminal."""
+    multi_part: Annotated[bool, Parameter(negative=())] = False
+    """Write EXR with one part per channel group."""
+    print_job: str | None = None
+    """Render nothing; print this command as a job for a render farm: openjd (Open Job Description)."""
 
 
 @app.command
@@ -119,8 +136,11 @@ def render(
     aov: str | None = None,
     opened: StageOptions | None = None,
     planned: PlanOptions | None = None,
+    ranged: RangeOptions | None = None,
 ) -> int:
     """Render frames to EXR (every data channel, linear) or PNG (the picture, sRGB).
+
+    SIGINT and SIGTERM stop after the frame at hand (exit 130 and 143); SIGUSR1 writes the last one as a PNG.
 
     Args:
         stage: A USD file.
@@ -130,83 +150,113 @@ def render(
         aov: Channels to write to EXR, comma-separated; without it all of them.
         opened: How the stage is opened.
         planned: What is simulated, and how.
+        ranged: How a range of frames is rendered.
     """
-    from warp_reflect.stage.frames import frame_name, has_frame_pattern, parse_frames
+    opened, planned, ranged = opened or StageOptions(), planned or PlanOptions(), ranged or RangeOptions()
+    part = _part(ranged.part)
+    if ranged.workers < 1:
+        raise ValueError(f"--workers: got {ranged.workers}, expected 1 or more")
+    job = _job(stage, [*outputs, *(output or [])], frames, aov, opened, planned, ranged)
+    if ranged.print_job is not None:
+        return _print_job(ranged.print_job, job, [*outputs, *(output or [])], frames, aov, opened, planned, ranged)
+    with reporting(ranged.progress) as report:
+        try:
+            job = replace(job, load=job.load | {"device": _open_device(opened.device)})
+            return pipeline.run(
+                job,
+                report,
+                resume=ranged.resume,
+                workers=ranged.workers,
+                scheduler=ranged.scheduler,
+                seconds=ranged.timelimit,
+                part=part,
+                strict=opened.strict,
+                debug=opened.debug,
+            )
+        except REFUSALS as error:
+            if report.style != "json":
+                raise
+            if opened.debug:
+                report.line(traceback.format_exc())
+            report.line(f"error: {one_line(error)}")
+            return IMPOSSIBLE
 
-    opened, planned = opened or StageOptions(), planned or PlanOptions()
-    names = [*outputs, *(output or [])]
+
+def _job(stage, names, frames, aov, opened: StageOptions, planned: PlanOptions, ranged: RangeOptions):
+    """The options of `render` as a `pipeline.Job`."""
+    from warp_reflect.stage.frames import frame_name, has_frame_pattern, parse_frames, snapshot_name
+
     if not names:
         raise ValueError("no output given; add a file such as out.exr or out.png")
     settings = _settings(planned)
     _check_method(planned.method)
     _check_size_options(planned)
-    channels = _channel_names(aov) if aov is not None else None
+    channels = tuple(_channel_names(aov)) if aov is not None else None
     if frames is None:
         for name in names:
             if has_frame_pattern(name):
                 raise ValueError(f"{name}: has a place for a frame number; add --frames")
-        times = [None]
-        files = [names]
+        times, files = (None,), (tuple(names),)
     else:
-        times = parse_frames(frames)
-        files = [[frame_name(name, time) for name in names] for time in times]
-    checked = {name for row in files[:1] for name in row}
-    for name in checked:
-        images.check_writable(name)
-    if len(checked) != len(names):
+        times = tuple(dict.fromkeys(parse_frames(frames)))
+        files = tuple(tuple(frame_name(name, time) for name in names) for time in times)
+    every = [name for row in files for name in row]
+    if len(set(every)) != len(every):
         raise ValueError(f"the same output is given twice: {', '.join(names)}")
-    device = _open_device(opened.device)
+    return Job(
+        stage,
+        times,
+        files,
+        load=_load_options(opened, planned, settings),
+        camera=planned.camera,
+        width=planned.image_width,
+        size=_size(planned.res) if planned.res is not None else None,
+        settings=settings,
+        method=planned.method,
+        channels=channels,
+        multi_part=ranged.multi_part,
+        snapshot=snapshot_name(names[0]),
+    )
 
-    written: list[str] = []
-    told: set = set()
-    with _progress(len(times)) as show:
-        try:
-            show("reading " + stage)
-            first = _load(stage, opened, planned, settings, device, times[0])
-            made, previous = None, None
-            for time, row in zip(times, files, strict=True):
-                label = stage if time is None else f"frame {time:g}"
-                scene = first if time == times[0] else first.at(time)
-                show(label, frames_done=len(written) // len(names))
-                if made is None or made.scene is not scene:
-                    made = _make_plan(scene, planned, settings)
-                    _print_notes([*scene.notes, *made.notes], told)
-                previous = _render_one(scene, made, previous, row, channels, written)
-        except (*REFUSALS, KeyboardInterrupt) as error:
-            if not written:
-                raise
-            if opened.debug:
-                traceback.print_exc()
-            _tell(f"error: {label}: {_line(error)}")
-            _tell(f"kept {len(written)} finished file{'s' if len(written) > 1 else ''}: {_shortened(written)}")
-            return PART_WAY
+
+def _part(text: str | None) -> tuple[int, int]:
+    """(k, n) of --part."""
+    if text is None:
+        return 1, 1
+    k, slash, n = text.partition("/")
+    if not (slash and k.strip().isdecimal() and n.strip().isdecimal() and 1 <= int(k) <= int(n)):
+        raise ValueError(f"--part: got '{text}', expected K/N such as 3/8, with K from 1 to N")
+    return int(k), int(n)
+
+
+def _print_job(kind, job, names, frames, aov, opened, planned, ranged) -> int:
+    from warp_reflect.farm import openjd_template
+
+    if kind != "openjd":
+        raise ValueError(f"--print-job: got '{kind}', expected openjd")
+    options = [*_as_tokens(opened), *_as_tokens(planned)]
+    options += ["--aov", aov] if aov is not None else []
+    options += ["--multi-part"] if ranged.multi_part else []
+    print(json.dumps(openjd_template(job.stage, names, frames, len(job.times), options), indent=2))
     return DONE
 
 
-def _render_one(scene, made, previous, row: list[str], channels: list[str] | None, written: list[str]):
-    """Render one frame, write its files, print a line for each; returns the frame."""
-    import warp_reflect as wr
-
-    start = perf_counter()
-    frame = wr.render_frame(scene, made, previous=previous)
-    rendered_ms = 1000.0 * (perf_counter() - start)
-    for name in row:
-        frame.write(name, channels=channels)
-        written.append(name)
-        width, height = made.size
-        print(f"{name}: {width}x{height}, {rendered_ms:.0f} ms{_statistics_line(frame.statistics)}", flush=True)
-    return frame
-
-
-def _statistics_line(statistics: dict) -> str:
-    """`, mirror pixels 12,345: 91.2 % candidate, 8.0 % walk, 0.8 % BVH`, as far as a frame counted it."""
-    names = {"candidate": "candidate", "walk": "walk", "empty": "sky", "bvh": "BVH"}
-    counts = {shown: int(statistics[key]) for key, shown in names.items() if key in statistics}
-    total = sum(counts.values())
-    if not total:
-        return ""
-    shares = ", ".join(f"{100.0 * number / total:.4g} % {shown}" for shown, number in counts.items())
-    return f", {total:,} mirror pixels: {shares}"
+def _as_tokens(options) -> list[str]:
+    """The command line of an options class, as far as it differs from the defaults."""
+    tokens = []
+    hints = get_type_hints(type(options), include_extras=True)
+    for each in fields(options):
+        value = getattr(options, each.name)
+        if value == each.default:
+            continue
+        named = [extra.name for extra in getattr(hints[each.name], "__metadata__", ()) if extra.name]
+        flag = named[0][0] if named else f"--{each.name.replace('_', '-')}"
+        if isinstance(value, bool):
+            tokens.append(flag)
+        else:
+            for item in value if isinstance(value, list) else [value]:
+                tokens += [flag, str(item)]
+    return tokens
 
 
 @app.command
@@ -246,7 +296,7 @@ def main(tokens: list[str] | None = None) -> int:
     try:
         command, bound, _ = app.parse_args(arguments, exit_on_error=False, print_error=False)
     except cyclopts.CycloptsError as error:
-        _tell(f"error: {_line(error)}")
+        _tell(f"error: {one_line(error)}")
         return IMPOSSIBLE
     try:
         code = command(*bound.args, **bound.kwargs) or DONE
@@ -259,34 +309,19 @@ def main(tokens: list[str] | None = None) -> int:
     except REFUSALS as error:
         if debug:
             traceback.print_exc()
-        _tell(f"error: {_line(error)}")
+        _tell(f"error: {one_line(error)}")
         return IMPOSSIBLE
     except KeyboardInterrupt:
         _tell("error: interrupted, nothing was written")
-        return PART_WAY
+        return INTERRUPTED
 
 
 def _say_fault(kind, error, _trace) -> None:
-    _tell(f"error: {kind.__name__}: {_line(error)} (a fault of warp-reflect: --debug shows where)")
-
-
-def _line(error: BaseException) -> str:
-    """An exception as one line."""
-    if isinstance(error, KeyboardInterrupt):
-        return "interrupted"
-    if isinstance(error, MemoryError):
-        return f"not enough memory {error}".strip()
-    # str() of a KeyError is its repr.
-    text = str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)
-    return " ".join(text.split()) or type(error).__name__
+    _tell(f"error: {kind.__name__}: {one_line(error)} (a fault of warp-reflect: --debug shows where)")
 
 
 def _tell(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
-
-
-def _shortened(names: list[str]) -> str:
-    return ", ".join(names) if len(names) <= 4 else f"{names[0]}, {names[1]} ... {names[-1]}"
 
 
 # Arguments.
@@ -356,77 +391,27 @@ def _purposes(text: str) -> tuple[str, ...]:
 # Scenes.
 
 
+def _load_options(opened: StageOptions, planned: PlanOptions, settings) -> dict:
+    """What `load_stage` gets beside the stage, the time and the device."""
+    return {
+        "purposes": _purposes(opened.purposes),
+        "complexity": settings.complexity,
+        "strict": opened.strict,
+        "reflectors": tuple(planned.reflector or ()),
+        "untrusted": opened.untrusted,
+        "root": opened.root or "",
+    }
+
+
 def _load(stage: str, opened: StageOptions, planned: PlanOptions, settings, device: str, time: float | None):
     import warp_reflect as wr
 
-    return wr.load_stage(
-        stage,
-        device=device,
-        time=time,
-        purposes=_purposes(opened.purposes),
-        complexity=settings.complexity,
-        strict=opened.strict,
-        reflectors=tuple(planned.reflector or ()),
-        untrusted=opened.untrusted,
-        root=opened.root or "",
-    )
+    return wr.load_stage(stage, device=device, time=time, **_load_options(opened, planned, settings))
 
 
 def _make_plan(scene, planned: PlanOptions, settings):
-    import warp_reflect as wr
-    from warp_reflect.planner import find_camera
-
-    if planned.res is not None:
-        size = _size(planned.res)
-    else:
-        path = find_camera(scene, planned.camera, (1, 1)).path
-        film = next(camera for camera in scene.data.cameras if camera.path == path)
-        height = planned.image_width * film.vertical_aperture / film.horizontal_aperture
-        size = planned.image_width, min(max(round(height), 1), SIDE_MAX)
-    return wr.make_plan(
-        scene,
-        camera=planned.camera,
-        size=size,
-        settings=settings,
-        method=planned.method,
-    )
-
-
-def _print_notes(notes: list, told: set) -> None:
-    """Notes not told before, one line each."""
-    fresh = [note for note in notes if note not in told]
-    told.update(fresh)
-    for note in fresh[:NOTES_SHOWN]:
-        _tell(f"note: {note.path}: {note.text}")
-    if len(fresh) > NOTES_SHOWN:
-        _tell(f"note: {len(fresh) - NOTES_SHOWN:,} more; `plan --json` lists them all")
-
-
-@contextmanager
-def _progress(total: int = 1) -> Iterator[Callable]:
-    """A line on a terminal that says what is going on, and is gone when it is done; nothing elsewhere."""
-    if not sys.stderr.isatty():
-        yield lambda text, frames_done=0: None
-        return
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        Progress,
-        SpinnerColumn,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    columns = [SpinnerColumn(), TextColumn("{task.description}", markup=False)]
-    columns += [BarColumn(), TimeRemainingColumn()] if total > 1 else [TimeElapsedColumn()]
-    with Progress(*columns, console=Console(stderr=True), transient=True, redirect_stdout=True) as progress:
-        task = progress.add_task("", total=total)
-
-        def show(text: str, frames_done: int = 0) -> None:
-            progress.update(task, description=text, completed=frames_done)
-
-        yield show
+    size = _size(planned.res) if planned.res is not None else None
+    return plan_scene(scene, planned.camera, planned.image_width, size, settings, planned.method)
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 from pxr import Tf, UsdUtils
 
@@ -36,6 +37,12 @@ def parse_frames(spec: str) -> list[float]:
 def has_frame_pattern(name: str) -> bool:
     """Whether an output name has a place for the frame number."""
     return _PATTERN.search(name) is not None
+
+
+def snapshot_name(pattern: str) -> str:
+    """Where a snapshot of an output goes: the name without the frame number, `out.####.exr` to `out.snapshot.png`."""
+    stem = _PATTERN.sub("", str(Path(pattern).with_suffix("")))
+    return f"{stem.rstrip('._-')}.snapshot.png"
 
 
 def frame_name(pattern: str, time: float) -> str:
