@@ -8,8 +8,6 @@ import re
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 
-import numpy as np
-
 from warp_reflect.scene import MaterialData, MirrorData, SceneData, reflectance
 from warp_reflect.settings import Settings
 
