@@ -224,9 +224,9 @@ def test_values_out_of_range_or_not_finite_are_told(stage):
 
 
 def test_what_is_not_simulated_is_noted(stage):
-    material = samples.add_material(stage, "/M", opacityThreshold=0.5)
+    material = samples.add_material(stage, "/M", displacement=0.5)
     samples.bind(samples.add_quad(stage, "/Quad"), material)
-    assert any("/M: inputs:opacityThreshold is not used" in text for text in texts(read_stage(samples.saved(stage))))
+    assert any("/M: inputs:displacement is not used" in text for text in texts(read_stage(samples.saved(stage))))
 
 
 def test_shape_lights_carry_their_radiance(stage):

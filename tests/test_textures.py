@@ -198,7 +198,7 @@ def test_level_follows_the_path_through_a_mirror(device, tmp_path):
 def test_white_furnace_holds_for_any_textured_metallic_and_roughness(device, tmp_path):
     rng = np.random.default_rng(5)
     write_exr(tmp_path / "n.exr", {"RGB": rng.uniform(0, 1, (16, 16, 3)).astype(np.float32)}, half=())
-    channel = {name: TextureRef(str(tmp_path / "n.exr"), c) for name, c in zip(textures.NUMBERS, "rgb", strict=True)}
+    channel = {name: TextureRef(str(tmp_path / "n.exr"), c) for name, c in zip(textures.NUMBERS, "rgbr", strict=True)}
     material = MaterialData("/m", base_color=(1.0, 1.0, 1.0), textures=channel)
     rgba, triangle = picture_of(scene_of([(quad(4.0), np.eye(4), material)], device), looking_down(2.0))
     assert (triangle >= 0).all()

@@ -15,7 +15,7 @@ from warp_reflect import bvh, launch
 from warp_reflect.layers import CameraView, GBuffer, ReflectionLayer, eye_ray_direction, eye_ray_origin
 from warp_reflect.scene import LightData, Scene, SceneView
 from warp_reflect.shapes import clamp_weights, intersect_triangle, unit
-from warp_reflect.surface import hit_normal
+from warp_reflect.surface import hit_normal, shown_normal
 
 wp.set_module_options({"enable_backward": False})
 
@@ -254,6 +254,7 @@ def direct_kernel(
     v: wp.array(dtype=float),
     direction: wp.array(dtype=wp.vec3),
     lit: wp.array(dtype=wp.uint8),
+    normals: wp.array(dtype=wp.vec3),
     out_irradiance: wp.array(dtype=wp.vec3),
 ):
     """One thread per point."""
@@ -264,7 +265,7 @@ def direct_kernel(
     corner = scene.triangles[tri]
     w = 1.0 - u[i] - v[i]
     p = w * scene.points[corner[0]] + u[i] * scene.points[corner[1]] + v[i] * scene.points[corner[2]]
-    n = hit_normal(scene, tri, u[i], v[i])
+    n = shown_normal(normals, i, hit_normal(scene, tri, u[i], v[i]))
     if wp.dot(n, direction[i]) > 0.0:
         n = -n
     total = wp.vec3(0.0, 0.0, 0.0)
@@ -289,6 +290,7 @@ def direct_irradiance(
     layer: ReflectionLayer | None = None,
     shadows: bool = False,
     threads: int = 0,
+    normals: wp.array | None = None,
 ) -> wp.array:
     """Irradiance of distant lights and shapes at what a frame shows, on the viewer's side.
 
@@ -299,6 +301,7 @@ def direct_irradiance(
         layer: What is seen in a mirror; None: of what the eye sees itself.
         shadows: Send rays towards the distant lights; those of shapes are never shadowed.
         threads: CPU threads; 0: one per core.
+        normals: From `normal_maps.prepare_normals`; None: no normal maps.
 
     Returns:
         vec3 [pixels of the G-buffer or of the layer], 0 where nothing is seen; length 0 where there are neither shapes
@@ -321,6 +324,8 @@ def direct_irradiance(
         towards = wp.array([view.to_light for view in lights.distant.list()], dtype=wp.vec3, device=device)
         lit = bvh.trace_shadows(scene, triangle, u, v, towards, threads)
     result = wp.zeros(len(triangle), dtype=wp.vec3, device=device)
-    inputs = [scene.view, lights, triangle, u, v, direction, lit, result]
+    if normals is None:
+        normals = wp.zeros(0, dtype=wp.vec3, device=device)
+    inputs = [scene.view, lights, triangle, u, v, direction, lit, normals, result]
     launch.launch(direct_kernel, len(triangle), inputs, device, threads)
     return result

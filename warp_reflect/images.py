@@ -272,7 +272,9 @@ def check_whole(path: str | os.PathLike) -> dict[str, object]:
     return {item.name: _parsed(item.value) for item in _read_parts(Path(path), FRAME_LIMIT_MB)[0][1].extra_attribs}
 
 
-def read_image(path: str | os.PathLike, color_space: str = "auto", size_limit_mb: int = SIZE_LIMIT_MB) -> Picture:
+def read_image(
+    path: str | os.PathLike, color_space: str = "auto", size_limit_mb: int = SIZE_LIMIT_MB, signed: bool = False
+) -> Picture:
     """Read a texture or an environment map.
 
     Args:
@@ -281,6 +283,7 @@ def read_image(path: str | os.PathLike, color_space: str = "auto", size_limit_mb
             pictures of 3 or 4 channels as sRGB, and converts float pictures that declare other primaries
             (ACEScg ...) to Rec.709.
         size_limit_mb: Decoded size above which the file is refused. [MB]
+        signed: Keep negative samples: directions, not light.
 
     Raises:
         ValueError: an unknown `color_space`.
@@ -299,7 +302,7 @@ def read_image(path: str | os.PathLike, color_space: str = "auto", size_limit_mb
         color = [names.index("Y")] * 3 if "Y" in names else [color[0] if color else 0] * 3
     rgb = np.ascontiguousarray(pixels[..., color])
     alpha = np.ascontiguousarray(pixels[..., names.index("A")]) if "A" in names else None
-    bad = ~(rgb >= 0.0) | (rgb > np.finfo(np.float32).max)
+    bad = ~np.isfinite(rgb) if signed else ~(rgb >= 0.0) | (rgb > np.finfo(np.float32).max)
     distinct = bad if len(set(color)) == 3 else bad[..., :1]
     cleaned = int(np.count_nonzero(distinct))
     if cleaned:

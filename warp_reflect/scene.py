@@ -97,11 +97,13 @@ class InstanceData:
 class TextureRef:
     """A picture that drives a material parameter: value = scale * texel + bias, of `channel`."""
 
-    file: str  # resolved; "package.usdz[inside.png]" where packed
-    channel: str = "rgb"  # or "r", "g", "b", "a"
-    color_space: str = "auto"  # "sRGB", "raw"; "raw" wherever the parameter is no colour
+    file: str  # resolved; "package.usdz[inside.png]" where packed; with "<UDIM>" in it a set of tiles
+    channel: str = "rgb"  # or "r", "g", "b", "a", or three of them in another order, as "rrr"
+    # "sRGB", "raw"; "raw" wherever the parameter is no colour; "signed": raw, values below 0 too
+    color_space: str = "auto"
     wrap: tuple[str, str] = ("useMetadata", "useMetadata")  # or "repeat", "clamp", "mirror", "black"
     scale: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
+    # Red to alpha; where channel is three letters, the first three belong to those.
     bias: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     uv_name: str = "st"  # the primvar in MeshData.uvs
     # Rows of the affine map from the primvar to picture coordinates, u right and v up: [u, v] = m @ [s, t, 1].
@@ -153,7 +155,7 @@ class MaterialData:
     clearcoat: float = 0.0
     clearcoat_roughness: float = 0.01
     uses_vertex_color: bool = False  # base_color is replaced by MeshData.colors
-    textures: dict[str, TextureRef] = field(default_factory=dict)  # by field name: "base_color", "roughness" ...
+    textures: dict[str, TextureRef] = field(default_factory=dict)  # by field name: "roughness" ...; "normal"
     mirror: MirrorData | None = None  # None: its values decide whether it is a mirror
 
 
@@ -238,8 +240,8 @@ class MaterialView:
     emissive: wp.vec3
     metallic: float
     roughness: float
-    opacity: float
     clearcoat: float
+    clearcoat_roughness: float
     clearcoat_f0: float
     uses_vertex_color: int
     specular_workflow: int
@@ -553,8 +555,8 @@ def material_view(material: MaterialData) -> MaterialView:
     view.emissive = wp.vec3(*material.emissive)
     view.metallic = 0.0 if material.specular_workflow else material.metallic
     view.roughness = material.roughness
-    view.opacity = material.opacity
     view.clearcoat = material.clearcoat
+    view.clearcoat_roughness = material.clearcoat_roughness
     view.clearcoat_f0 = ((1.0 - material.ior) / (1.0 + material.ior)) ** 2
     view.uses_vertex_color = int(material.uses_vertex_color)
     view.specular_workflow = int(material.specular_workflow)

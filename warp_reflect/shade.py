@@ -10,7 +10,9 @@ Approximates UsdPreviewSurface, textures included (`textures.py`):
 * roughness: up to `SHARP_ROUGHNESS` a surface mirrors, from `ROUGH_ROUGHNESS` on its specular share is
   reflected like Lambert's, between them it is divided linearly (a lobe's shape is not modelled); a reflector
   mirrors whatever its roughness;
-* energy: what the clear coat and the mirror term take is taken from the layers below.
+* the clear coat's roughness divides its share as the base's is divided;
+* energy: what the clear coat and the mirror term take is taken from the layers below;
+* normal maps turn the normal of what is no reflector, seen directly or in one; a reflector keeps its own.
 
 Opacity is not looked at. The background is the dome; alpha is coverage.
 """
@@ -25,9 +27,10 @@ import warp as wp
 from warp_reflect import launch
 from warp_reflect.direct import AREA_KINDS, DirectView, direct_irradiance, prepare_direct
 from warp_reflect.layers import CameraView, GBuffer, ReflectionLayer, eye_ray_direction, eye_ray_origin
+from warp_reflect.normal_maps import prepare_normals
 from warp_reflect.scene import SHAPE_QUADRIC, Scene, SceneView
 from warp_reflect.shapes import clamp_weights, intersect_triangle, unit
-from warp_reflect.surface import hit_normal
+from warp_reflect.surface import hit_normal, shown_normal
 from warp_reflect.textures import Look, plain_look, prepare_looks
 
 wp.set_module_options({"enable_backward": False})
@@ -247,14 +250,20 @@ def schlick(f0: wp.vec3, f90: wp.vec3, cosine: float) -> wp.vec3:
 
 
 @wp.func
+def sharp_share(roughness: float, reflector: bool) -> float:
+    """Share of a specular lobe that is reflected as a mirror does."""
+    if reflector:
+        return 1.0
+    return wp.clamp((ROUGH_ROUGHNESS - roughness) / (ROUGH_ROUGHNESS - SHARP_ROUGHNESS), 0.0, 1.0)
+
+
+@wp.func
 def split_lobes(look: Look, irradiance: wp.vec3, cosine: float, reflector: bool) -> Lobes:
     """Base radiance and mirror weight of a surface.
 
     `irradiance` is that of the viewer's side, `cosine` that of the angle of incidence.
     """
-    sharp = wp.clamp((ROUGH_ROUGHNESS - look.roughness) / (ROUGH_ROUGHNESS - SHARP_ROUGHNESS), 0.0, 1.0)
-    if reflector:
-        sharp = float(1.0)
+    sharp = sharp_share(look.roughness, reflector)
     mirror = wp.vec3(0.0, 0.0, 0.0)
     if sharp > 0.0:
         mirror = sharp * schlick(look.f0, look.f90, cosine)
@@ -264,8 +273,10 @@ def split_lobes(look: Look, irradiance: wp.vec3, cosine: float, reflector: bool)
     if look.clearcoat > 0.0:
         f0 = look.clearcoat_f0
         coat = look.clearcoat * schlick(wp.vec3(f0, f0, f0), wp.vec3(1.0, 1.0, 1.0), cosine)[0]
-        albedo = (1.0 - coat) * albedo
-        mirror = (1.0 - coat) * mirror + wp.vec3(coat, coat, coat)
+        sharp_coat = coat * sharp_share(look.clearcoat_roughness, reflector)
+        blurred_coat = coat - sharp_coat
+        albedo = (1.0 - coat) * albedo + wp.vec3(blurred_coat, blurred_coat, blurred_coat)
+        mirror = (1.0 - coat) * mirror + wp.vec3(sharp_coat, sharp_coat, sharp_coat)
     lobes = Lobes()
     lobes.base = look.emissive + wp.cw_mul(albedo, (1.0 / PI) * irradiance)
     lobes.mirror = mirror
@@ -285,6 +296,7 @@ def hit_radiance(
     scene: SceneView,
     lights: LightView,
     looks: wp.array(dtype=Look),
+    normals: wp.array(dtype=wp.vec3),
     direct: wp.array(dtype=wp.vec3),
     i: int,
     triangle: int,
@@ -297,7 +309,7 @@ def hit_radiance(
     weight = wp.vec3(1.0, 1.0, 1.0)
     onward = direction
     if triangle >= 0:
-        n = hit_normal(scene, triangle, u, v)
+        n = shown_normal(normals, i, hit_normal(scene, triangle, u, v))
         cosine = wp.dot(n, direction)
         onward = direction - 2.0 * cosine * n
         if cosine > 0.0:
@@ -322,6 +334,7 @@ def shade_kernel(
     camera: CameraView,
     lights: LightView,
     looks: wp.array(dtype=Look),
+    normals: wp.array(dtype=wp.vec3),
     direct: wp.array(dtype=wp.vec3),
     triangle: wp.array(dtype=int),
     reflector_id: wp.array(dtype=int),
@@ -354,7 +367,7 @@ def shade_kernel(
                 scene.points[corner[2]] - camera.eye,
             )
             uv = clamp_weights(hit.u, hit.v)
-        n = hit_normal(scene, tri, uv[0], uv[1])
+        n = shown_normal(normals, i, hit_normal(scene, tri, uv[0], uv[1]))
         cosine = wp.dot(n, incident)
         onward = incident - 2.0 * cosine * n
         if cosine > 0.0:
@@ -383,6 +396,7 @@ def mirror_term_kernel(
     scene: SceneView,
     lights: LightView,
     looks: wp.array(dtype=Look),
+    normals: wp.array(dtype=wp.vec3),
     direct: wp.array(dtype=wp.vec3),
     pixel: wp.array(dtype=int),
     direction: wp.array(dtype=wp.vec3),
@@ -396,7 +410,7 @@ def mirror_term_kernel(
     """One thread per mirror pixel; finds the mirror's weight in `out_mirror`."""
     i = first + wp.tid()
     p = pixel[i]
-    seen = hit_radiance(scene, lights, looks, direct, i, triangle[i], u[i], v[i], direction[i])
+    seen = hit_radiance(scene, lights, looks, normals, direct, i, triangle[i], u[i], v[i], direction[i])
     term = wp.cw_mul(out_mirror[p], seen)
     out_mirror[p] = term
     out_picture[p] += wp.vec4(term[0], term[1], term[2], 0.0)
@@ -424,14 +438,17 @@ def shade(
     picture = wp.empty(count, dtype=wp.vec4, device=device)
     mirror = wp.empty(count, dtype=wp.vec3, device=device)
     looks = prepare_looks(scene, gbuffer, None, threads)
-    direct = direct_irradiance(scene, lights.direct, gbuffer, None, shadows, threads)
-    inputs = [scene.view, gbuffer.view, lights, looks, direct, gbuffer.triangle, gbuffer.reflector_id, picture, mirror]
+    normals = prepare_normals(scene, gbuffer, None, threads)
+    direct = direct_irradiance(scene, lights.direct, gbuffer, None, shadows, threads, normals)
+    inputs = [scene.view, gbuffer.view, lights, looks, normals, direct, gbuffer.triangle, gbuffer.reflector_id]
+    inputs += [picture, mirror]
     launch.launch(shade_kernel, count, inputs, device, threads)
     for layer in layers.values():
         pixels = layer.pixels
         looks = prepare_looks(scene, gbuffer, layer, threads)
-        direct = direct_irradiance(scene, lights.direct, gbuffer, layer, shadows, threads)
-        inputs = [scene.view, lights, looks, direct, pixels.pixel, pixels.direction]
+        normals = prepare_normals(scene, gbuffer, layer, threads)
+        direct = direct_irradiance(scene, lights.direct, gbuffer, layer, shadows, threads, normals)
+        inputs = [scene.view, lights, looks, normals, direct, pixels.pixel, pixels.direction]
         inputs += [layer.triangle, layer.u, layer.v, picture, mirror]
         launch.launch(mirror_term_kernel, pixels.count, inputs, device, threads)
     return picture, mirror

@@ -67,6 +67,22 @@ def hit_normal(scene: SceneView, triangle: int, u: float, v: float) -> wp.vec3:
 
 
 @wp.func
+def shown_normal(normals: wp.array(dtype=wp.vec3), i: int, own: wp.vec3) -> wp.vec3:
+    """The normal to shade point i with: of its normal map, or the surface's own where it has none.
+
+    Args:
+        normals: From `normal_maps.prepare_normals`; length 0: no normal maps.
+        i: The point.
+        own: The surface's.
+    """
+    if normals.shape[0] > 0:
+        mapped = normals[i]
+        if wp.dot(mapped, mapped) > 0.0:
+            return mapped
+    return own
+
+
+@wp.func
 def polish(scene: SceneView, triangle: int, p: wp.vec3, direction: wp.vec3) -> wp.vec4:
     """Move a point near a facet along its ray onto the analytic surface behind the facet.
 

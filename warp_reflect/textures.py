@@ -6,6 +6,9 @@ the levels chosen from the width of the pixel's cone on the surface.
 
 A parameter with a picture uses it at every pixel of a mesh with texture coordinates. Elsewhere, and for the choice
 of mirrors, it has the picture's mean.
+
+Of a UDIM set the tiles are read that triangles lie in; each is a picture of its own, clamped at its borders. Normal maps
+are kept here too, and looked up in `normal_maps.py`.
 """
 
 from __future__ import annotations
@@ -13,6 +16,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import tempfile
+import zipfile
 from collections.abc import Callable, Iterable
 from weakref import WeakValueDictionary
 
@@ -32,7 +36,8 @@ TEXELS_MAX = 2**28  # float32 values of all pyramids together (1 GiB); above it 
 
 # Parameters that are looked up, by their name in MaterialData; those of one component apart.
 COLORS = ("base_color", "emissive", "specular_color")
-NUMBERS = ("metallic", "roughness", "clearcoat")
+NUMBERS = ("metallic", "roughness", "clearcoat", "clearcoat_roughness")
+NORMAL = "normal"  # the normal map, looked up apart
 # What says whether a surface is a mirror (with the base colour, for metals).
 MIRROR_NUMBERS = ("metallic", "roughness", "clearcoat", "clearcoat_roughness")
 
@@ -46,6 +51,13 @@ WRAPS = {"useMetadata": 0, "repeat": 0, "clamp": 1, "mirror": 2, "black": 3}
 # At a grazing angle the cone's footprint is a line; a box filter that covered its length would blur it across.
 LEAST_COSINE = wp.constant(0.1)
 LEAST_LENGTH = wp.constant(1.0e-30)  # keeps the quotient of two lengths finite
+# UDIM: tile = 1001 + column + 10 * row.
+TILE_MARK = "<UDIM>"
+TILE_FIRST = 1001
+TILE_COLUMNS = wp.constant(10)
+TILE_ROWS = wp.constant(100)  # beyond the four digits of a tile's name
+# A decoded direction of a normal map shorter than this has lost its direction; the surface's own normal is used.
+LEAST_DIRECTION = 0.1
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -53,6 +65,7 @@ class Pyramid:
     """A picture's levels, float32 [height, width, 1 or 3] each, the finest first and the last a single texel."""
 
     levels: tuple[np.ndarray, ...]
+    notes: tuple[str, ...] = ()  # what was met reading it
 
     @property
     def mean(self) -> np.ndarray:
@@ -83,6 +96,9 @@ class TextureView:
     bias: wp.vec3
     u_row: wp.vec3  # u = dot(u_row, (s, t, 1))
     v_row: wp.vec3
+    first_tile: int  # of a UDIM set, in `TextureSet.tiles`; -1: one picture
+    tile_count: int
+    without: wp.vec3  # value where a tile is missing
 
 
 @wp.struct
@@ -96,6 +112,8 @@ class BindingView:
     metallic: int
     roughness: int
     clearcoat: int
+    clearcoat_roughness: int
+    normal: int
 
 
 @wp.struct
@@ -108,6 +126,9 @@ class TextureSet:
     texels: wp.array(dtype=float)
     uvs: wp.array(dtype=wp.vec2)
     uv_index: wp.array(dtype=wp.vec3i)  # per triangle; (-1, -1, -1): without coordinates
+    tiles: wp.array(dtype=int)  # of all UDIM sets: index into `textures`, -1 where a tile is missing
+    look_count: int  # textures of parameters
+    normal_count: int  # normal maps
 
 
 def picture_key(texture: TextureRef) -> str:
@@ -122,7 +143,7 @@ def read_pictures(
 
     Args:
         textures: Their files; a packed one is copied out of its package first.
-        tell: Called for a picture that cannot be read, which is left out.
+        tell: Called for a picture that cannot be read, which is left out, and for one that was repaired.
         skip: Keys that are not read.
 
     Returns:
@@ -140,19 +161,23 @@ def read_pictures(
                 picture = _read(texture)
             except (OSError, ValueError) as fault:
                 picture = None
-                tell(texture, " ".join(str(fault).split()))
+                tell(texture, f"{' '.join(str(fault).split())}; its fallback is used")
+            if picture is not None and picture.cleaned:
+                tell(texture, f"{texture.file}: {picture.cleaned} samples that are no light (NaN, infinite, < 0) are 0")
         if picture is not None:
             found[key] = reduced(_channels(picture, texture.channel))
     return found
 
 
 def _read(texture: TextureRef) -> Picture:
+    signed = texture.color_space == "signed"
+    space = "raw" if signed else texture.color_space
     if not texture.file.endswith("]"):
-        return read_image(texture.file, texture.color_space)
+        return read_image(texture.file, space, signed=signed)
     from warp_reflect.stage.textures import unpacked  # needs the USD library
 
     with tempfile.TemporaryDirectory(prefix="warp_reflect_") as folder:
-        return read_image(unpacked(texture.file, folder), texture.color_space)
+        return read_image(unpacked(texture.file, folder), space, signed=signed)
 
 
 def _channels(picture: Picture, channel: str) -> np.ndarray:
@@ -161,6 +186,8 @@ def _channels(picture: Picture, channel: str) -> np.ndarray:
     if channel == "a":
         alpha = np.ones(picture.rgb.shape[:2], np.float32) if picture.alpha is None else picture.alpha
         return alpha[..., None]
+    if len(channel) > 1:
+        return np.concatenate([_channels(picture, letter) for letter in channel], axis=-1)
     first = "rgb".index(channel)
     return picture.rgb[..., first : first + 1]
 
@@ -210,8 +237,18 @@ def load_pyramids(data: SceneData, textures: list[TextureRef], tell: Callable) -
         return {key: make_pyramid(data.pictures[key]) for key in keys if key in data.pictures}
     marks = {picture_key(texture): _mark(texture) for texture in textures}
     result = {key: _alive[mark] for key, mark in marks.items() if mark in _alive}
-    for key, picture in read_pictures(textures, tell, skip=result).items():
-        result[key] = _alive[marks[key]] = make_pyramid(picture)
+    for texture in {picture_key(texture): texture for texture in textures}.values():
+        for text in result[picture_key(texture)].notes if picture_key(texture) in result else ():
+            tell(texture, text)
+    told: dict[str, list[str]] = {}
+
+    def remember(texture: TextureRef, text: str) -> None:
+        told.setdefault(texture.file, []).append(text)
+        tell(texture, text)
+
+    for key, picture in read_pictures(textures, remember, skip=result).items():
+        notes = told.get(key.split("|", 2)[2], ())
+        result[key] = _alive[marks[key]] = dataclasses.replace(make_pyramid(picture), notes=tuple(notes))
     return result
 
 
@@ -232,23 +269,75 @@ def with_pictures(data: SceneData) -> SceneData:
     """
     if not any(material.textures for material in data.materials):
         return data
-    used = [(m, name, t) for m in data.materials for name, t in m.textures.items() if name in _looked_at(m)]
+    used = [
+        (material, name, texture)
+        for k, material in enumerate(data.materials)
+        for name in material.textures
+        if name in LOOKED_AT
+        for texture in pictures_of(data, k, name)
+    ]
     paths = {picture_key(texture): (material.path, name) for material, name, texture in used}
 
-    def tell(texture: TextureRef, fault: str) -> None:
+    def tell(texture: TextureRef, text: str) -> None:
         path, name = paths[picture_key(texture)]
-        data.notes.append(_unreadable(path, name, fault))
+        data.notes.append(_note(path, name, text))
 
     return dataclasses.replace(data, pictures=read_pictures([texture for _, _, texture in used], tell))
 
 
-def _looked_at(material: MaterialData) -> set[str]:
-    """The parameters whose pictures are needed: looked up, or decisive for whether it is a mirror."""
-    return {*COLORS, *NUMBERS, *MIRROR_NUMBERS} & set(material.textures)
+# Parameters whose pictures are needed: looked up, or decisive for whether a surface is a mirror.
+LOOKED_AT = frozenset((*COLORS, *NUMBERS, *MIRROR_NUMBERS, NORMAL))
 
 
-def _unreadable(path: str, name: str, fault: str) -> Note:
-    return Note(path, f"texture of {name}: {fault}; its fallback is used")
+def _note(path: str, name: str, text: str) -> Note:
+    return Note(path, f"texture of {name}: {text}")
+
+
+def pictures_of(data: SceneData, material: int, name: str) -> list[TextureRef]:
+    """The pictures behind a parameter: its texture, or the tiles of a UDIM set that triangles lie in and that exist."""
+    texture = data.materials[material].textures[name]
+    if TILE_MARK not in texture.file:
+        return [texture]
+    tiles = [_tile(texture, number) for number in used_tiles(data, material, texture)]
+    if data.pictures is not None:
+        return [tile for tile in tiles if picture_key(tile) in data.pictures]
+    return [tile for tile in tiles if _exists(tile.file)]
+
+
+def _tile(texture: TextureRef, number: int) -> TextureRef:
+    file = texture.file.replace(TILE_MARK, str(TILE_FIRST + number))
+    return dataclasses.replace(texture, file=file, wrap=("clamp", "clamp"))
+
+
+def _exists(file: str) -> bool:
+    if not file.endswith("]"):
+        return os.path.isfile(file)
+    package, _, inside = file[:-1].partition("[")
+    try:
+        with zipfile.ZipFile(package) as archive:
+            return inside in archive.namelist()
+    except (OSError, zipfile.BadZipFile):
+        return False
+
+
+def used_tiles(data: SceneData, material: int, texture: TextureRef) -> list[int]:
+    """The UDIM tiles, counted from 0, that triangles of a material lie in; a triangle's middle decides."""
+    rows = np.array(texture.uv_from_st)
+    found: set[int] = set()
+    for mesh, parts in {(i.mesh, tuple(m == material for m in i.materials)) for i in data.instances}:
+        uvs, index = data.meshes[mesh].uvs, data.meshes[mesh].uv_index
+        if uvs is None or not any(parts):
+            continue
+        index = data.meshes[mesh].triangles if index is None else index
+        ranges = data.meshes[mesh].parts
+        for k, mine in enumerate(parts):
+            if mine:
+                own = index[ranges[k].first_triangle :][: ranges[k].triangle_count] if ranges else index
+                middle = uvs[own].astype(np.float64).mean(axis=1)
+                column, row = np.floor(middle @ rows[:, :2].T + rows[:, 2]).T
+                inside = (column >= 0) & (column < int(TILE_COLUMNS)) & (row >= 0) & (row < int(TILE_ROWS))
+                found |= set((column + int(TILE_COLUMNS) * row)[inside].astype(int).tolist())
+    return sorted(found)
 
 
 def mirror_constants(data: SceneData) -> tuple[list[MaterialData], list[Note], dict[str, Pyramid]]:
@@ -260,45 +349,44 @@ def mirror_constants(data: SceneData) -> tuple[list[MaterialData], list[Note], d
     notes: list[Note] = []
     pyramids: dict[str, Pyramid] = {}
     materials = []
-    for material in data.materials:
+    for k, material in enumerate(data.materials):
         names = [name for name in MIRROR_NUMBERS if name in material.textures]
         if "base_color" in material.textures and (material.metallic > 0.0 or "metallic" in names):
             names.append("base_color")
         if "specular_color" in material.textures and material.specular_workflow:
             names.append("specular_color")
-        material, told = _with_means(data, material, names, pyramids)
+        material, known, told = _with_means(data, k, names, pyramids)
         notes += told
-        numbers = [name for name in names if name in MIRROR_NUMBERS]
-        if numbers and not told:
+        numbers = [name for name in known if name in MIRROR_NUMBERS]
+        if numbers:
             means = ", ".join(f"{name} {getattr(material, name):.3g}" for name in numbers)
             notes.append(Note(material.path, f"whether it is a mirror is decided by the textures' means: {means}"))
         materials.append(material)
     return materials, notes, pyramids
 
 
-def _with_means(data, material: MaterialData, names: list[str], pyramids: dict) -> tuple[MaterialData, list[Note]]:
-    """The material with the means of its named pictures, and notes of those that cannot be read."""
+def _with_means(data, index: int, names: list[str], pyramids: dict) -> tuple[MaterialData, list[str], list[Note]]:
+    """(the material with the means of its named pictures, the names of those, notes of what was met reading them)."""
+    material = data.materials[index]
     notes: list[Note] = []
     values: dict = {}
     for name in names:
-        texture = material.textures[name]
-        key = picture_key(texture)
-        if key not in pyramids:
-            pyramids.update(
-                load_pyramids(
-                    data,
-                    [texture],
-                    lambda _, fault, name=name: notes.append(_unreadable(material.path, name, fault)),
-                )
-            )
-        if key in pyramids:
-            values[name] = _mean(texture, pyramids[key], name)
-    return (dataclasses.replace(material, **values) if values else material), notes
+        textures = pictures_of(data, index, name)
+
+        def tell(_, text: str, name=name) -> None:
+            notes.append(_note(material.path, name, text))
+
+        missing = [texture for texture in textures if picture_key(texture) not in pyramids]
+        pyramids.update(load_pyramids(data, missing, tell))
+        known = [pyramids[picture_key(texture)] for texture in textures if picture_key(texture) in pyramids]
+        if known:
+            values[name] = _mean(material.textures[name], known, name)
+    return (dataclasses.replace(material, **values) if values else material), list(values), notes
 
 
-def _mean(texture: TextureRef, pyramid: Pyramid, name: str):
+def _mean(texture: TextureRef, pyramids: list[Pyramid], name: str):
     scale, bias = _scale_bias(texture)
-    value = np.maximum(scale * pyramid.mean + bias, 0.0)
+    value = np.maximum(scale * np.mean([pyramid.mean for pyramid in pyramids], axis=0) + bias, 0.0)
     if name in COLORS:
         return tuple(float(v) for v in value)
     return float(min(value.mean(), 1.0))
@@ -306,7 +394,7 @@ def _mean(texture: TextureRef, pyramid: Pyramid, name: str):
 
 def _scale_bias(texture: TextureRef) -> tuple[np.ndarray, np.ndarray]:
     """Scale and bias of the channels that are used, float64 [3]; of a single one, three times that."""
-    chosen = [0, 1, 2] if texture.channel == "rgb" else ["rgba".index(texture.channel)] * 3
+    chosen = [0, 1, 2] if len(texture.channel) == 3 else ["rgba".index(texture.channel)] * 3
     return np.array(texture.scale, np.float64)[chosen], np.array(texture.bias, np.float64)[chosen]
 
 
@@ -316,46 +404,80 @@ def prepare_textures(scene: Scene, pyramids: dict[str, Pyramid]) -> TextureSet:
     What cannot be read is noted in `scene.notes`, and the parameter keeps its constant.
     """
     data = scene.data
-    names = (*COLORS, *NUMBERS)
-    has_uvs = any(data.meshes[instance.mesh].uvs is not None for instance in data.instances)
+    names = (*COLORS, *NUMBERS, NORMAL)
     used = []
-    if has_uvs:
+    if any(data.meshes[instance.mesh].uvs is not None for instance in data.instances):
         used = [(k, name) for k, m in enumerate(data.materials) for name in names if name in m.textures]
-    paths = {picture_key(data.materials[k].textures[name]): (data.materials[k].path, name) for k, name in used}
+    sources = {(k, name): pictures_of(data, k, name) for k, name in used}
+    paths = {
+        picture_key(texture): (data.materials[k].path, name) for (k, name), all_ in sources.items() for texture in all_
+    }
     noted: set[Note] = set(scene.notes)
 
-    def tell(texture: TextureRef, fault: str) -> None:
-        note = _unreadable(*paths[picture_key(texture)], fault)
-        if note not in noted:
-            scene.notes.append(note)
+    def note(path: str, name: str, text: str) -> None:
+        found = _note(path, name, text)
+        if found not in noted:
+            noted.add(found)
+            scene.notes.append(found)
 
-    missing = [data.materials[k].textures[name] for k, name in used]
-    missing = [texture for texture in missing if picture_key(texture) not in pyramids]
-    pyramids.update(load_pyramids(data, missing, tell))
+    missing = [texture for textures in sources.values() for texture in textures if picture_key(texture) not in pyramids]
+    pyramids.update(load_pyramids(data, missing, lambda texture, text: note(*paths[picture_key(texture)], text)))
 
     bindings = [_constants() for _ in data.materials]
     views: list[TextureView] = []
     levels: list[LevelView] = []
     texels: list[np.ndarray] = []
+    tiles: list[int] = []
     first_level: dict[str, int] = {}
     kept = _within_budget({key: pyramids[key] for key in paths if key in pyramids})
-    texel_count = 0
-    for k, name in used:
-        texture = data.materials[k].textures[name]
-        key = picture_key(texture)
-        if key not in kept:
+    texel_count = look_count = normal_count = 0
+    for (k, name), textures in sources.items():
+        material = data.materials[k]
+        textures = [texture for texture in textures if picture_key(texture) in kept]
+        for texture in textures:
+            key = picture_key(texture)
+            if key not in first_level:
+                first_level[key] = len(levels)
+                for pixels in kept[key]:
+                    level = LevelView()
+                    level.first_texel, level.height, level.width = texel_count, *pixels.shape[:2]
+                    levels.append(level)
+                    texels.append(pixels.reshape(-1))
+                    texel_count += pixels.size
+                if name == NORMAL:
+                    empty = _directionless(texture, kept[key][0])
+                    if empty:
+                        note(material.path, name, f"{empty} of {kept[key][0][..., 0].size} texels hold no direction")
+        whole = material.textures[name]
+        if TILE_MARK in whole.file:
+            _tell_missing_tiles(data, k, name, whole, textures, note)
+            by_file = {texture.file: texture for texture in textures}
+            numbers = used_tiles(data, k, whole)
+            table = np.full(max(numbers, default=-1) + 1, -1, np.int32)
+            for number in numbers:
+                texture = by_file.get(_tile(whole, number).file)
+                if texture is not None:
+                    table[number] = len(views)
+                    views.append(_texture_view(texture, first_level[picture_key(texture)], kept[picture_key(texture)]))
+            if not textures:
+                continue
+            set_view = _texture_view(textures[0], first_level[picture_key(textures[0])], kept[picture_key(textures[0])])
+            set_view.first_tile, set_view.tile_count = len(tiles), len(table)
+            set_view.without = wp.vec3(*np.broadcast_to(getattr(material, name, 0.0), (3,)))
+            tiles += table.tolist()
+            number_of_view = len(views)
+            views.append(set_view)
+        elif textures:
+            number_of_view = len(views)
+            views.append(_texture_view(whole, first_level[picture_key(whole)], kept[picture_key(whole)]))
+        else:
             continue
-        if key not in first_level:
-            first_level[key] = len(levels)
-            for pixels in kept[key]:
-                level = LevelView()
-                level.first_texel, level.height, level.width = texel_count, *pixels.shape[:2]
-                levels.append(level)
-                texels.append(pixels.reshape(-1))
-                texel_count += pixels.size
-        setattr(bindings[k], name, len(views))
-        bindings[k].count += 1
-        views.append(_texture_view(texture, first_level[key], kept[key]))
+        setattr(bindings[k], name, number_of_view)
+        if name == NORMAL:
+            normal_count += 1
+        else:
+            bindings[k].count += 1
+            look_count += 1
 
     result = TextureSet()
     device = scene.device
@@ -367,12 +489,29 @@ def prepare_textures(scene: Scene, pyramids: dict[str, Pyramid]) -> TextureSet:
     result.texels = wp.array(flat, dtype=float, device=device)
     result.uvs = wp.array(uvs, dtype=wp.vec2, device=device)
     result.uv_index = wp.array(uv_index, dtype=wp.vec3i, device=device)
+    result.tiles = wp.array(np.array(tiles, np.int32), dtype=int, device=device)
+    result.look_count, result.normal_count = look_count, normal_count
     return result
+
+
+def _tell_missing_tiles(data, material: int, name: str, whole: TextureRef, found: list[TextureRef], note) -> None:
+    """One note for the tiles of a set that are needed and not there."""
+    files = {texture.file for texture in found}
+    absent = [n for n in used_tiles(data, material, whole) if _tile(whole, n).file not in files]
+    if absent:
+        listed = ", ".join(str(TILE_FIRST + number) for number in absent)
+        note(data.materials[material].path, name, f"{whole.file}: no tile {listed}; its fallback is used there")
+
+
+def _directionless(texture: TextureRef, pixels: np.ndarray) -> int:
+    """Texels of a normal map that decode to no direction."""
+    scale, bias = _scale_bias(texture)
+    return int(np.count_nonzero(np.linalg.norm(pixels * scale + bias, axis=-1) < LEAST_DIRECTION))
 
 
 def _constants() -> BindingView:
     binding = BindingView()
-    for name in (*COLORS, *NUMBERS):
+    for name in (*COLORS, *NUMBERS, NORMAL):
         setattr(binding, name, -1)
     return binding
 
@@ -398,6 +537,7 @@ def _texture_view(texture: TextureRef, first_level: int, levels: tuple[np.ndarra
     view.wrap_u, view.wrap_v = (WRAPS[mode] for mode in texture.wrap)
     view.scale, view.bias = wp.vec3(*scale), wp.vec3(*bias)
     view.u_row, view.v_row = (wp.vec3(*row) for row in texture.uv_from_st)
+    view.first_tile = -1
     return view
 
 
@@ -490,25 +630,55 @@ def sample_level(textures: TextureSet, texture: TextureView, number: int, u: flo
     return (1.0 - fy) * top + fy * bottom
 
 
+@wp.struct
+class Spot:
+    """Where textures are looked up."""
+
+    st: wp.vec2
+    width: float  # of the footprint, in texture coordinates
+    middle: wp.vec2  # of the triangle's coordinates: says which UDIM tile it lies in
+
+
 @wp.func
-def sample(textures: TextureSet, number: int, st: wp.vec3) -> wp.vec3:
-    """The value of a texture, not below 0.
+def tile_view(textures: TextureSet, whole: TextureView, middle: wp.vec2) -> int:
+    """Index of the texture of a UDIM set that a triangle with that middle lies in; -1: there is none."""
+    p = wp.vec3(middle[0], middle[1], 1.0)
+    column = int(wp.clamp(wp.floor(wp.dot(whole.u_row, p)), -1.0, float(TILE_COLUMNS)))
+    row = int(wp.clamp(wp.floor(wp.dot(whole.v_row, p)), -1.0, float(TILE_ROWS)))
+    number = row * TILE_COLUMNS + column
+    if column < 0 or column >= TILE_COLUMNS or row < 0 or number >= whole.tile_count:
+        return -1
+    return textures.tiles[whole.first_tile + number]
+
+
+@wp.func
+def sample_signed(textures: TextureSet, number: int, spot: Spot) -> wp.vec3:
+    """The value of a texture.
 
     Args:
         textures: All of the scene.
         number: Which.
-        st: Texture coordinates s and t, and the width of the footprint in them (see `footprint`).
+        spot: From `footprint`.
 
     Returns:
         scale * texel + bias.
     """
-    texture = textures.textures[number]
-    p = wp.vec3(st[0], st[1], 1.0)
-    u = wp.dot(texture.u_row, p)
-    v = wp.dot(texture.v_row, p)
+    whole = textures.textures[number]
+    p = wp.vec3(spot.st[0], spot.st[1], 1.0)
+    u = wp.dot(whole.u_row, p)
+    v = wp.dot(whole.v_row, p)
+    chosen = int(number)
+    if whole.first_tile >= 0:
+        chosen = tile_view(textures, whole, spot.middle)
+        if chosen < 0:
+            return whole.without
+        q = wp.vec3(spot.middle[0], spot.middle[1], 1.0)
+        u -= wp.floor(wp.dot(whole.u_row, q))
+        v -= wp.floor(wp.dot(whole.v_row, q))
+    texture = textures.textures[chosen]
     finest = textures.levels[texture.first_level]
     magnified = wp.abs(texture.u_row[0] * texture.v_row[1] - texture.u_row[1] * texture.v_row[0])
-    texels = st[2] * wp.sqrt(magnified * float(finest.width) * float(finest.height))
+    texels = spot.width * wp.sqrt(magnified * float(finest.width) * float(finest.height))
     value = wp.vec3(0.0, 0.0, 0.0)
     if texels <= 1.0:
         value = sample_level(textures, texture, 0, u, v)
@@ -519,14 +689,20 @@ def sample(textures: TextureSet, number: int, st: wp.vec3) -> wp.vec3:
         value = (1.0 - share) * sample_level(textures, texture, lower, u, v)
         if share > 0.0:
             value += share * sample_level(textures, texture, lower + 1, u, v)
-    value = wp.cw_mul(texture.scale, value) + texture.bias
+    return wp.cw_mul(texture.scale, value) + texture.bias
+
+
+@wp.func
+def sample(textures: TextureSet, number: int, spot: Spot) -> wp.vec3:
+    """The value of a texture, not below 0; see `sample_signed`."""
+    value = sample_signed(textures, number, spot)
     return wp.vec3(wp.max(value[0], 0.0), wp.max(value[1], 0.0), wp.max(value[2], 0.0))
 
 
 @wp.func
 def footprint(
     textures: TextureSet, scene: SceneView, triangle: int, u: float, v: float, direction: wp.vec3, width: float
-) -> wp.vec3:
+) -> Spot:
     """Texture coordinates at a hit, and how much of them the pixel's cone covers.
 
     Args:
@@ -556,7 +732,11 @@ def footprint(
     covered = float(0.0)
     if area > 0.0:
         covered = width / wp.max(cosine, LEAST_COSINE) * wp.sqrt(picture_area / area)
-    return wp.vec3(st[0], st[1], covered)
+    spot = Spot()
+    spot.st = st
+    spot.width = covered
+    spot.middle = (a + b + c) / 3.0
+    return spot
 
 
 @wp.struct
@@ -569,6 +749,7 @@ class Look:
     emissive: wp.vec3
     roughness: float
     clearcoat: float
+    clearcoat_roughness: float
     clearcoat_f0: float
 
 
@@ -580,6 +761,7 @@ def with_base(look: Look, color: wp.vec3, metallic: float) -> Look:
     result.emissive = look.emissive
     result.roughness = look.roughness
     result.clearcoat = look.clearcoat
+    result.clearcoat_roughness = look.clearcoat_roughness
     result.clearcoat_f0 = look.clearcoat_f0
     result.base_color = color
     result.f0 = wp.vec3(dielectric, dielectric, dielectric) + metallic * color
@@ -598,6 +780,7 @@ def plain_look(scene: SceneView, triangle: int, u: float, v: float) -> Look:
     look.emissive = scene.materials[material].emissive
     look.roughness = scene.materials[material].roughness
     look.clearcoat = scene.materials[material].clearcoat
+    look.clearcoat_roughness = scene.materials[material].clearcoat_roughness
     look.clearcoat_f0 = scene.materials[material].clearcoat_f0
     if scene.materials[material].uses_vertex_color != 0 and scene.color_index.shape[0] > 0:
         index = scene.color_index[triangle]
@@ -626,6 +809,8 @@ def look_at_point(
         look.roughness = wp.min(sample(textures, binding.roughness, st)[0], 1.0)
     if binding.clearcoat >= 0:
         look.clearcoat = wp.min(sample(textures, binding.clearcoat, st)[0], 1.0)
+    if binding.clearcoat_roughness >= 0:
+        look.clearcoat_roughness = wp.min(sample(textures, binding.clearcoat_roughness, st)[0], 1.0)
     color = look.base_color
     if binding.base_color >= 0:
         color = below_one(sample(textures, binding.base_color, st))
@@ -722,11 +907,11 @@ def prepare_looks(scene: Scene, gbuffer: GBuffer, layer: ReflectionLayer | None,
         threads: CPU threads; 0: one per core.
 
     Returns:
-        `Look` [pixels of the G-buffer or of the layer], not set where nothing is seen; length 0 where nothing of the
-        scene is textured.
+        `Look` [pixels of the G-buffer or of the layer], not set where nothing is seen; length 0 where no parameter of
+        the scene is textured.
     """
     textures = scene.textures
-    if textures.textures.shape[0] == 0:
+    if textures.look_count == 0:
         return wp.zeros(0, dtype=Look, device=scene.device)
     if layer is None:
         looks = wp.zeros(len(gbuffer.triangle), dtype=Look, device=scene.device)

@@ -6,18 +6,26 @@ import dataclasses
 from dataclasses import dataclass, field
 
 import numpy as np
-from pxr import Tf, UsdShade
+from pxr import Sdf, Tf, UsdShade
 
 from warp_reflect.scene import MaterialData, TextureRef
 from warp_reflect.stage.intake import Intake, library_message
+from warp_reflect.stage.materialx import referenced_material
+from warp_reflect.stage.networks import LETTERS, Signal, Unmapped, constant, evaluate, picked, product, widened
 from warp_reflect.stage.primvars import display_color, read_primvar
-from warp_reflect.stage.textures import is_texture, read_texture, scaled, value_of
+from warp_reflect.stage.textures import ENCODED_NORMAL, read_texture, scaled, value_of
 
-# Fields of MaterialData whose textures shade.py looks up.
-SHADED_TEXTURES = ("base_color", "emissive", "specular_color", "metallic", "roughness", "clearcoat")
-NODE_HOPS_MAX = 16  # nodes followed from a surface input; longer chains (and cycles) are not evaluated
-PASS_THROUGH = ("ND_convert_", "ND_dot_", "ND_normalmap")
-EXTRACTED = ("r", "g", "b", "a")
+# Fields of MaterialData whose textures shade.py looks up, and what else a texture decides.
+SHADED_TEXTURES = (
+    "base_color",
+    "emissive",
+    "specular_color",
+    "metallic",
+    "roughness",
+    "clearcoat",
+    "clearcoat_roughness",
+)
+NORMAL = "normal"
 
 
 @dataclass(frozen=True)
@@ -78,11 +86,12 @@ SURFACES = {
     "ND_standard_surface_surfaceshader": _STANDARD,
     "ND_open_pbr_surface_surfaceshader": _OPEN_PBR,
 }
+NORMAL_INPUTS = ("normal", "geometry_normal")
 # Inputs that change the picture and are not simulated: noted where they are driven, or not this value.
 UNUSED = {
-    "normal": None,
     "displacement": 0.0,
-    "opacityThreshold": 0.0,
+    "specular": 1.0,
+    "specular_weight": 1.0,
     "transmission": 0.0,
     "transmission_weight": 0.0,
     "subsurface": 0.0,
@@ -91,18 +100,29 @@ UNUSED = {
     "fuzz_weight": 0.0,
     "thin_film_thickness": 0.0,
     "thin_film_weight": 0.0,
-    "geometry_normal": None,
     "coat_normal": None,
+    "geometry_coat_normal": None,
 }
 
 
 @dataclass(frozen=True)
 class _PrimvarInput:
-    """A parameter that a primvar of the drawn prim sets."""
+    """A parameter that a primvar of the drawn prim sets, by `signal`."""
 
     parameter: _Parameter
-    primvar: str
+    signal: Signal
     fallback: float | tuple[float, ...]
+
+    @property
+    def primvar(self) -> str:
+        return self.signal.primvar
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether the value is the primvar's own."""
+        signal = widened(self.signal, self.parameter.width)
+        plain = signal.components == tuple(range(signal.width))
+        return plain and bool((signal.scale == 1.0).all() and (signal.bias == 0.0).all())
 
 
 @dataclass(frozen=True)
@@ -115,7 +135,8 @@ class Surface:
     @property
     def color_primvar(self) -> str:
         """The primvar that sets the base colour; empty: none does."""
-        return next((p.primvar for p in self.primvars if p.parameter.field == "base_color"), "")
+        found = (p for p in self.primvars if p.parameter.field == "base_color" and p.is_plain)
+        return next((p.primvar for p in found), "")
 
     @property
     def uv_primvars(self) -> list[str]:
@@ -129,7 +150,7 @@ class MaterialTable:
 
     intake: Intake
     materials: list[MaterialData] = field(default_factory=list)
-    _surfaces: dict[str, Surface | None] = field(default_factory=dict)
+    _surfaces: dict = field(default_factory=dict)  # by material prim, or by path where there is no prim
     _index: dict = field(default_factory=dict)
 
     def bound(self, target) -> Surface | None:
@@ -140,6 +161,15 @@ class MaterialTable:
         except Tf.ErrorException as fault:
             self.intake.bad(target.GetPath(), f"material:binding: {library_message(fault)}; not used")
             return None
+        if not material and relationship:
+            path = next(iter(relationship.GetTargets()), None)
+            other, told = referenced_material(target.GetStage(), path, self.intake) if path else (None, False)
+            if other:
+                if path not in self._surfaces:
+                    self._surfaces[path] = read_material(other, self.intake, str(path))
+                return self._surfaces[path]
+            if told:
+                return None
         if not material:
             if relationship:
                 targets = ", ".join(f"<{t}>" for t in relationship.GetTargets())
@@ -150,7 +180,7 @@ class MaterialTable:
             return None
         prim = material.GetPrim()
         # The copies of an instance share the material of their prototype.
-        key = str((prim.GetPrimInPrototype() if prim.IsInstanceProxy() else prim).GetPath())
+        key = prim.GetPrimInPrototype() if prim.IsInstanceProxy() else prim
         if key not in self._surfaces:
             self._surfaces[key] = read_material(material, self.intake)
         return self._surfaces[key]
@@ -173,7 +203,7 @@ class MaterialTable:
             return self._add(data, (data.base_color, opacity, has_colors))
         data, values = surface.data, []
         for each in surface.primvars:
-            if each.parameter.field == "base_color" and has_colors:
+            if each.parameter.field == "base_color" and has_colors and each.is_plain:
                 data = dataclasses.replace(data, uses_vertex_color=True)
                 values.append(True)
                 continue
@@ -183,14 +213,17 @@ class MaterialTable:
         return self._add(data, (id(surface), *values))
 
     def _primvar_value(self, prim, each: _PrimvarInput):
-        found = read_primvar(prim, each.primvar, each.parameter.width, self.intake)
+        signal = each.signal
+        width = max(each.parameter.width if each.is_plain else signal.width, max(signal.components) + 1)
+        found = read_primvar(prim, each.primvar, width, self.intake)
         if found is None:
             return each.fallback
         values = found.flat()
         if found.interpolation != "constant" and np.ptp(values, axis=0).any():
             self.intake.note(prim.GetPath(), f"primvars:{each.primvar}: its mean is used for {each.parameter.name}")
             values = values.mean(axis=0, keepdims=True)
-        return _fitted(values[0], each.parameter)
+        result = signal.scale * values[0][list(signal.components)] + signal.bias
+        return _fitted(result[: each.parameter.width], each.parameter)
 
     def _add(self, data: MaterialData, key: tuple) -> int:
         if key not in self._index:
@@ -199,9 +232,15 @@ class MaterialTable:
         return self._index[key]
 
 
-def read_material(material: UsdShade.Material, intake: Intake) -> Surface | None:
-    """A UsdShade material; None (with a note) where no surface of it is understood."""
-    path = material.GetPath()
+def read_material(material: UsdShade.Material, intake: Intake, name: str = "") -> Surface | None:
+    """A UsdShade material; None (with a note) where no surface of it is understood.
+
+    Args:
+        material: The material.
+        intake: The reading.
+        name: What to call it; empty: its path.
+    """
+    path = Sdf.Path(name) if name else material.GetPath()
     met = []
     for context in ("", "mtlx"):
         shader, _, _ = material.ComputeSurfaceSource(context)
@@ -212,7 +251,12 @@ def read_material(material: UsdShade.Material, intake: Intake) -> Surface | None
             met.append(str(identifier))
     if met:
         intake.note(path, f"info:id: got {met[0]}, expected one of {', '.join(SURFACES)}; displayColor is used")
-    else:
+        return None
+    # A Material that is a reference to one in a .mtlx file, which the library could not compose.
+    other, told = referenced_material(material.GetPrim().GetStage(), path, intake)
+    if other:
+        return read_material(other, intake, str(path))
+    if not told:
         intake.note(path, "outputs:surface: no surface shader; displayColor is used")
     return None
 
@@ -222,23 +266,21 @@ def _read_surface(shader: UsdShade.Shader, parameters, path: str, intake: Intake
     textures: dict[str, TextureRef] = {}
     primvars: list[_PrimvarInput] = []
     for parameter in parameters:
-        weight = _weight(shader, parameter, intake)
-        value = _evaluate(shader, parameter, intake)
+        value = _driven(shader, parameter, intake)
         if isinstance(value, _PrimvarInput):
             primvars.append(value)
             value = value.fallback
         if isinstance(value, tuple) and isinstance(value[0], TextureRef):
-            texture, value = value
-            textures[parameter.field] = texture if weight == 1.0 else scaled(texture, weight)
-        if parameter.width == 3:
-            values[parameter.field] = tuple(float(weight * v) for v in value)
-        else:
-            values[parameter.field] = float(value)
-    unshaded = sorted(set(textures) - set(SHADED_TEXTURES))
+            textures[parameter.field], value = value
+        values[parameter.field] = value
+    normal = _read_normal(shader, intake)
+    if normal is not None:
+        textures[NORMAL] = normal
+    values["specular_workflow"] = value_of(shader, "useSpecularWorkflow", intake) == 1
+    _read_opacity(shader, values, textures, primvars, path, intake)
+    unshaded = sorted(set(textures) - {*SHADED_TEXTURES, NORMAL})
     if unshaded:
         intake.note(path, f"textures of {', '.join(unshaded)} are read but not shaded; constants are used")
-    workflow = value_of(shader, "useSpecularWorkflow", intake)
-    values["specular_workflow"] = workflow == 1
     for name, idle in UNUSED.items():
         found = shader.GetInput(name)
         if found and (found.HasConnectedSource() or (idle is not None and found.Get(intake.time) not in (None, idle))):
@@ -246,71 +288,111 @@ def _read_surface(shader: UsdShade.Shader, parameters, path: str, intake: Intake
     return Surface(MaterialData(**values, textures=textures), tuple(primvars))
 
 
-def _weight(shader: UsdShade.Shader, parameter: _Parameter, intake: Intake) -> float:
-    if not parameter.weight:
-        return 1.0
-    found = value_of(shader, parameter.weight, intake)
-    if found is None:
-        return parameter.weight_default
-    return float(np.clip(np.nan_to_num(float(found)), 0.0, None))
+def _read_opacity(shader, values: dict, textures: dict, primvars: list, path: str, intake: Intake) -> None:
+    """Opacity as it is drawn: 0 is not drawn at all, everything else is opaque, with a note."""
+    threshold = value_of(shader, "opacityThreshold", intake)
+    threshold = float(threshold) if isinstance(threshold, (int, float)) and np.isfinite(threshold) else 0.0
+    if textures.pop("opacity", None) is not None:
+        cut = "cutouts by a texture are not simulated" if threshold > 0.0 else "a texture's opacity is not simulated"
+        intake.note(path, f"inputs:opacity: {cut}; drawn opaque")
+        values["opacity"] = 1.0
+    elif any(each.parameter.field == "opacity" for each in primvars):
+        return
+    elif 0.0 < threshold:
+        values["opacity"] = float(values["opacity"] >= threshold)
+    elif 0.0 < values["opacity"] < 1.0:
+        intake.note(path, f"inputs:opacity: got {values['opacity']:g}; blending is not simulated, drawn opaque")
 
 
-def _evaluate(shader: UsdShade.Shader, parameter: _Parameter, intake: Intake):
-    """What drives an input: a constant, a `_PrimvarInput`, or (TextureRef, fallback value)."""
+def _read_normal(shader: UsdShade.Shader, intake: Intake) -> TextureRef | None:
+    """The normal map of a surface; None where it has none that can be used, with a note if it meant to."""
+    path = shader.GetPath()
+    preview = "UsdPreviewSurface" in str(shader.GetIdAttr().Get())
+    for name in NORMAL_INPUTS:
+        try:
+            signal = evaluate(shader, name, intake)
+            if signal is None or signal.is_constant:
+                continue  # one normal for a whole surface says nothing in tangent space
+            if signal.primvar or signal.width < 3 or not (preview or signal.tangent):
+                raise Unmapped("driven by what is no tangent space picture")
+        except Unmapped as fault:
+            intake.note(path, f"inputs:{name}: {fault}; the surface's own normal is used")
+            continue
+        texture, _ = _texture(widened(signal, 3), "normal", intake)
+        if texture is not None and preview and texture.scale[:3] == (1.0,) * 3 and texture.bias[:3] == (0.0,) * 3:
+            scale, bias = ENCODED_NORMAL
+            intake.note(
+                signal.picture.GetPath(),
+                f"scale and bias are 1 and 0: right for directions stored as they are; one in 8 bits needs {scale:g} "
+                f"and {bias:g}",
+            )
+        return texture
+    return None
+
+
+def _driven(shader: UsdShade.Shader, parameter: _Parameter, intake: Intake):
+    """What sets a parameter: a constant, a `_PrimvarInput`, or (TextureRef, fallback value)."""
     path, name = shader.GetPath(), parameter.name
-    node, input_name, channel = shader, name, ""
-    for _ in range(NODE_HOPS_MAX):
-        found = node.GetInput(input_name)
-        sources = UsdShade.Utils.GetValueProducingAttributes(found) if found else ()
-        if not sources:
-            return parameter.default
-        attribute = sources[0]
-        if not UsdShade.Output.IsOutput(attribute):
-            return _constant(attribute.Get(intake.time), path, parameter, intake)
-        node = UsdShade.Shader(attribute.GetPrim())
-        identifier = (node.GetIdAttr().Get() if node else None) or ""
-        output = UsdShade.Output(attribute).GetBaseName()
-        if is_texture(identifier):
-            texture, fallback = read_texture(node, channel or output, parameter.width, intake)
-            value = parameter.default
-            if fallback is not None:
-                first = EXTRACTED.index(channel or output) if (channel or output) in EXTRACTED else 0
-                value = _fitted(fallback[:3] if parameter.width == 3 else fallback[first : first + 1], parameter)
-            return value if texture is None else (texture, value)
-        if identifier.startswith(("UsdPrimvarReader", "ND_UsdPrimvarReader", "ND_geompropvalue", "ND_geomcolor")):
-            key = "geomprop" if "geompropvalue" in identifier else "varname"
-            default = "default" if identifier.startswith("ND_geom") else "fallback"
-            fallback = value_of(node, default, intake)
-            fallback = parameter.default if fallback is None else _constant(fallback, path, parameter, intake)
-            primvar = "displayColor" if "geomcolor" in identifier else value_of(node, key, intake)
-            return _PrimvarInput(parameter, str(primvar), fallback) if primvar else fallback
-        if identifier.startswith("ND_constant_"):
-            input_name = "value"
-        elif identifier.startswith(PASS_THROUGH):
-            input_name = "in"
-        elif identifier.startswith("ND_extract_"):
-            channel = EXTRACTED[int(value_of(node, "index", intake) or 0) % 4]
-            input_name = "in"
+    try:
+        signal = evaluate(shader, name, intake)
+        weight = evaluate(shader, parameter.weight, intake) if parameter.weight else None
+    except Unmapped as fault:
+        text = str(fault)
+        if text.startswith("got "):
+            intake.bad(path, f"inputs:{name}: {text}; its default is used")
         else:
-            break
-    intake.note(path, f"inputs:{name}: driven by {identifier or 'an unknown node'}; its default is used")
-    return parameter.default
-
-
-def _constant(value, path, parameter: _Parameter, intake: Intake):
-    if value is None:
+            intake.note(path, f"inputs:{name}: {text}; its default is used")
         return parameter.default
-    array = np.asarray(value)
-    array = array.astype(np.float64).reshape(-1) if array.dtype.kind in "fiu" else np.zeros(0)
+    if parameter.weight:
+        weight = constant(parameter.weight_default) if weight is None else weight
+        if weight.is_constant:
+            weight = constant(np.clip(np.nan_to_num(weight.bias), 0.0, None))
+        signal = product(constant(parameter.default) if signal is None else signal, weight)
+    if signal is None:
+        return parameter.default
+    for note in signal.notes:
+        intake.note(path, f"inputs:{name}: {note}")
+    if signal.is_constant:
+        return _constant(signal.bias, path, parameter, intake)
+    if signal.primvar:
+        fallback = parameter.default
+        if signal.fallback is not None:
+            wide = signal.scale * signal.fallback[list(signal.components)] + signal.bias
+            fallback = _constant(wide[: parameter.width], path, parameter, intake)
+        return _PrimvarInput(parameter, signal, fallback)
+    if parameter.width == 1 and signal.width > 1:
+        signal = picked(signal, [0])
+    texture, value = _texture(widened(signal, parameter.width), "color" if parameter.width == 3 else "data", intake)
+    value = parameter.default if value is None else _fitted(value, parameter)
+    return value if texture is None else (texture, value)
+
+
+def _texture(signal: Signal, use: str, intake: Intake):
+    """(TextureRef or None, fallback float64 [1 or 3] or None) of a signal whose source is a picture."""
+    letters = "".join(LETTERS[k] for k in signal.components)
+    same = len(set(letters)) == 1 and np.ptp(signal.scale) == 0.0 and np.ptp(signal.bias) == 0.0
+    if same:
+        letters = letters[0]
+    texture, fallback = read_texture(signal.picture, letters, use, intake)
+    if fallback is not None:
+        fallback = signal.scale * fallback[list(signal.components)] + signal.bias
+    if texture is not None and ((signal.scale != 1.0).any() or (signal.bias != 0.0).any()):
+        kept = slice(0, 1) if same else slice(None)
+        texture = scaled(texture, signal.scale[kept], signal.bias[kept])
+    return texture, fallback
+
+
+def _constant(array: np.ndarray, path, parameter: _Parameter, intake: Intake):
+    got = array[0] if len(array) == 1 else tuple(array.tolist())
     if len(array) not in (1, 3) or not np.isfinite(array).all():
         intake.bad(
             path,
-            f"inputs:{parameter.name}: got {value}, expected {parameter.width} finite number(s); its default is used",
+            f"inputs:{parameter.name}: got {got}, expected {parameter.width} finite number(s); its default is used",
         )
         return parameter.default
     fitted = _fitted(array, parameter)
     if not np.allclose(fitted, array.mean() if parameter.width == 1 else array, rtol=0.0, atol=1e-12):
-        intake.note(path, f"inputs:{parameter.name}: got {value}, used as {fitted}")
+        intake.note(path, f"inputs:{parameter.name}: got {got}, used as {fitted}")
     return fitted
 
 

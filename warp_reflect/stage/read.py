@@ -20,6 +20,7 @@ from pxr import Sdf, Tf, Usd, UsdGeom, UsdUtils  # isort: skip
 
 from warp_reflect.stage.assemble import Assembly, MeshEntry
 from warp_reflect.stage.lights import SHADED_KINDS, default_dome
+from warp_reflect.stage.materialx import is_materialx_error
 from warp_reflect.stage.reflectors import Choices, choose_reflectors, parse_patterns
 from warp_reflect.stage.schema import register
 from warp_reflect.stage.walk import State, Walk
@@ -125,7 +126,9 @@ class StageReader:
     def _read(self, time: float | None, intake: Intake) -> SceneData:
         data = self._metadata(time, intake)
         for error in self.stage.GetCompositionErrors():
-            intake.bad(error.rootSite.path, f"composition: {' '.join(str(error).split())}")
+            text = " ".join(str(error).split())
+            if not is_materialx_error(text):  # what is needed of such a file is read, or noted, where it is bound
+                intake.bad(error.rootSite.path, f"composition: {text}")
         choices = Choices(self.patterns, {}, data.collections)
         walk = Walk(self.stage, intake, self.purposes, self.path, data.up_axis, choices)
         placed = walk.below(self.stage.GetPseudoRoot(), State(np.eye(4)), Usd.PrimDefaultPredicate)

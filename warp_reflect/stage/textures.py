@@ -26,9 +26,24 @@ WRAPS = {  # MaterialX's names on the right of ours
     "black": "black",
     "useMetadata": "useMetadata",
 }
-COLOR_SPACES = {"sRGB": "sRGB", "raw": "raw", "auto": "auto", "srgb_texture": "sRGB", "lin_rec709": "raw"}
-CHANNELS = ("rgb", "r", "g", "b", "a")
+# Names of UsdUVTexture's input, of MaterialX and of USD's colour space metadata.
+COLOR_SPACES = {
+    "auto": "auto",
+    "sRGB": "sRGB",
+    "srgb_texture": "sRGB",
+    "srgb_rec709_scene": "sRGB",
+    "g22_rec709": "sRGB",
+    "g22_rec709_scene": "sRGB",
+    "raw": "raw",
+    "data": "raw",
+    "none": "raw",
+    "identity": "raw",
+    "lin_rec709": "raw",
+    "lin_rec709_scene": "raw",
+}
 PACKED_MAX = 512 * 2**20  # bytes of one picture inside a .usdz
+TILE_MARK = "<UDIM>"
+ENCODED_NORMAL = (2.0, -1.0)  # scale and bias that make a direction of an 8-bit normal map
 
 
 def is_texture(identifier: str) -> bool:
@@ -36,13 +51,13 @@ def is_texture(identifier: str) -> bool:
     return identifier == "UsdUVTexture" or identifier.startswith(("ND_UsdUVTexture", "ND_image_", "ND_tiledimage_"))
 
 
-def read_texture(node: UsdShade.Shader, output: str, width: int, intake: Intake):
+def read_texture(node: UsdShade.Shader, channel: str, use: str, intake: Intake):
     """A picture node.
 
     Args:
         node: UsdUVTexture, or MaterialX' image.
-        output: Name of the output that is used.
-        width: Components of the parameter it drives; 1 takes one channel, and raw values.
+        channel: As in `TextureRef`.
+        use: "color", "data" (raw values whatever the node says) or "normal" (raw values with a sign).
         intake: The reading.
 
     Returns:
@@ -59,38 +74,52 @@ def read_texture(node: UsdShade.Shader, output: str, width: int, intake: Intake)
     file = resolve_asset(asset, attribute, intake)
     if not file:
         return None, fallback
-    channel = output if output in CHANNELS else "rgb"
-    if width == 1 and channel == "rgb":
-        channel = "r"
-    space = value_of(node, "sourceColorSpace", intake) or attribute.GetColorSpace() or "auto"
-    if width == 1 or channel == "a":
-        space = "raw"  # data maps are often tagged sRGB by mistake
     uv_name, uv_from_st = _coordinates(node, coordinates, intake)
     if identifier.startswith("ND_tiledimage_"):
         tiling, offset = value_of(node, "uvtiling", intake), value_of(node, "uvoffset", intake)
         scale = np.diag([*_vector(tiling, (1.0, 1.0)), 1.0])
         scale[:2, 2] = -_vector(offset, (0.0, 0.0))
         uv_from_st = scale @ uv_from_st
+    scale = _vector(value_of(node, "scale", intake), (1.0,) * 4)
+    bias = _vector(value_of(node, "bias", intake), (0.0,) * 4)
+    if not np.isfinite([*scale, *bias, *uv_from_st.reshape(-1)]).all():
+        intake.bad(path, "inputs:scale, inputs:bias: got a value that is not finite; its fallback is used")
+        return None, fallback
+    chosen = ["rgba".index(letter) for letter in channel]
+    if len(chosen) == 3:  # the scale of a mixed order belongs to the result's components
+        scale, bias = np.append(scale[chosen], 1.0), np.append(bias[chosen], 0.0)
     texture = TextureRef(
         file,
         channel,
-        COLOR_SPACES.get(str(space), "auto"),
+        _color_space(node, attribute, channel, use, intake),
         tuple(WRAPS.get(str(value_of(node, name, intake)), "useMetadata") for name in (wrap_u, wrap_v)),
-        tuple(_vector(value_of(node, "scale", intake), (1.0,) * 4).tolist()),
-        tuple(_vector(value_of(node, "bias", intake), (0.0,) * 4).tolist()),
+        tuple(scale.tolist()),
+        tuple(bias.tolist()),
         uv_name,
         tuple(tuple(row) for row in uv_from_st[:2].tolist()),
     )
-    if not np.isfinite([*texture.scale, *texture.bias, *uv_from_st.reshape(-1)]).all():
-        intake.bad(path, "inputs:scale, inputs:bias: got a value that is not finite; its fallback is used")
-        return None, fallback
     return texture, fallback
 
 
-def scaled(texture: TextureRef, factor) -> TextureRef:
-    """The texture times a constant: a number, or one per channel."""
-    factor = np.ones(4) * np.append(factor, 1.0) if np.ndim(factor) else np.array([factor] * 3 + [1.0])
-    scale, bias = np.array(texture.scale) * factor, np.array(texture.bias) * factor
+def _color_space(node: UsdShade.Shader, attribute, channel: str, use: str, intake: Intake) -> str:
+    tag = str(value_of(node, "sourceColorSpace", intake) or attribute.GetColorSpace() or "auto")
+    space = COLOR_SPACES.get(tag)
+    if use == "color" and channel != "a":
+        if space is None:
+            intake.note(node.GetPath(), f"color space: got {tag}, which is not known; auto is used")
+        return space or "auto"
+    if space == "sRGB" and channel != "a":
+        # One picture often holds colour for one node and numbers for another, and both get the same tag.
+        intake.note(node.GetPath(), f"color space: got {tag} on values that are no colour; they are read raw")
+    return "signed" if use == "normal" else "raw"
+
+
+def scaled(texture: TextureRef, factor, offset=0.0) -> TextureRef:
+    """The texture times a factor plus an offset, each a number or one per component of the result."""
+    slots = [0, 1, 2] if len(texture.channel) == 3 else ["rgba".index(texture.channel)]
+    scale, bias = np.array(texture.scale), np.array(texture.bias)
+    scale[slots] *= factor
+    bias[slots] = bias[slots] * factor + offset
     return dataclasses.replace(texture, scale=tuple(scale.tolist()), bias=tuple(bias.tolist()))
 
 
@@ -111,9 +140,8 @@ def resolve_asset(asset, attribute, intake: Intake) -> str:
         return ""
     owner = attribute.GetPrim().GetPath()
     label = f"{attribute.GetName()}: @{asset.path}@"
-    if "<UDIM>" in asset.path:
-        intake.note(owner, f"{label}: a UDIM set is not used; its fallback is")
-        return ""
+    if TILE_MARK in asset.path:
+        return _resolve_tiles(asset.path.replace("\\", "/"), attribute, label, intake)
     file = asset.resolvedPath
     if not file and "\\" in asset.path:
         layer = attribute.GetPropertyStack(intake.time)[0].layer
@@ -127,6 +155,24 @@ def resolve_asset(asset, attribute, intake: Intake) -> str:
         intake.bad(owner, f"{label}: {fault}; its fallback is used")
         return ""
     return file
+
+
+def _resolve_tiles(path: str, attribute, label: str, intake: Intake) -> str:
+    """The pattern of a UDIM set's files, absolute; "" with a note where it has none."""
+    owner = attribute.GetPrim().GetPath()
+    layer = attribute.GetPropertyStack(intake.time)[0].layer
+    tiles = UsdShade.UdimUtils.ResolveUdimTilePaths(path, layer)
+    if not tiles:
+        intake.note(owner, f"{label}: no tile of this set was found; its fallback is used")
+        return ""
+    for file, _ in tiles:
+        fault = confinement_fault(file, intake.limits.root)
+        if fault:
+            intake.bad(owner, f"{label}: {fault}; its fallback is used")
+            return ""
+    first, number = tiles[0]
+    stem, _, ending = first.rpartition(number)
+    return f"{stem}{TILE_MARK}{ending}"
 
 
 def unpacked(file: str, folder: str | Path) -> Path:
@@ -175,18 +221,85 @@ def _coordinates(node: UsdShade.Shader, name: str, intake: Intake) -> tuple[str,
         identifier = (node.GetIdAttr().Get() if node else None) or ""
         if identifier.startswith(("UsdPrimvarReader", "ND_UsdPrimvarReader", "ND_geompropvalue")):
             key = "geomprop" if "geomprop" in identifier else "varname"
-            return str(value_of(node, key, intake) or "st"), affine
-        if identifier not in ("UsdTransform2d", "ND_UsdTransform2d"):
-            if not identifier.startswith("ND_texcoord"):
+            primvar = str(value_of(node, key, intake) or "st")
+            return ("st" if primvar == "UV0" else primvar), affine  # MaterialX' name of the first set
+        kind = identifier.removeprefix("ND_").partition("_")[0]
+        if kind not in _STEPS:
+            if kind != "texcoord":
                 intake.note(node.GetPath(), f"info:id: {identifier or None} as coordinates is not used; st is")
             return "st", affine
-        angle = np.radians(float(value_of(node, "rotation", intake) or 0.0))
-        scale = _vector(value_of(node, "scale", intake), (1.0, 1.0))
-        step = np.eye(3)
-        step[:2, :2] = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) * scale
-        step[:2, 2] = _vector(value_of(node, "translation", intake), (0.0, 0.0))
-        affine, name = affine @ step, "in"
+        step, name = _STEPS[kind](node, intake)
+        if step is None or not np.isfinite(step).all():
+            intake.note(node.GetPath(), f"info:id: {identifier} of two sets of coordinates is not used; st is")
+            return "st", affine
+        affine = affine @ step
     return "st", affine
+
+
+def _turn(degrees: float, clockwise: bool = False) -> np.ndarray:
+    angle = np.radians(-degrees if clockwise else degrees)
+    return np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
+
+
+def _shift(x: float, y: float) -> np.ndarray:
+    return np.array([[1.0, 0.0, x], [0.0, 1.0, y], [0.0, 0.0, 1.0]])
+
+
+def _step_transform(node: UsdShade.Shader, intake: Intake):
+    """UsdTransform2d: scaled, then turned, then moved."""
+    turn = _turn(float(value_of(node, "rotation", intake) or 0.0))
+    scale = _vector(value_of(node, "scale", intake), (1.0, 1.0))
+    return _shift(*_vector(value_of(node, "translation", intake), (0.0, 0.0))) @ turn @ np.diag([*scale, 1.0]), "in"
+
+
+def _step_place(node: UsdShade.Shader, intake: Intake):
+    """MaterialX' place2d: about a pivot divided by the scale, turned, the offset taken; or the other way round."""
+    pivot = _vector(value_of(node, "pivot", intake), (0.0, 0.0))
+    with np.errstate(divide="ignore"):
+        shrink = np.diag([*(1.0 / _vector(value_of(node, "scale", intake), (1.0, 1.0))), 1.0])
+    # MaterialX' rotate2d turns by (c x + s y, -s x + c y).
+    turn = _turn(float(value_of(node, "rotate", intake) or 0.0), clockwise=True)
+    move = _shift(*-_vector(value_of(node, "offset", intake), (0.0, 0.0)))
+    inner = shrink @ turn @ move if int(value_of(node, "operationorder", intake) or 0) == 1 else move @ turn @ shrink
+    return _shift(*pivot) @ inner @ _shift(*-pivot), "texcoord"
+
+
+def _step_rotate(node: UsdShade.Shader, intake: Intake):
+    return _turn(float(value_of(node, "amount", intake) or 0.0), clockwise=True), "in"
+
+
+def _step_arithmetic(node: UsdShade.Shader, intake: Intake):
+    """A sum, difference, product or quotient with a constant; None for the step where there is none."""
+    operation = node.GetIdAttr().Get().removeprefix("ND_").partition("_")[0]
+    identity = 1.0 if operation in ("multiply", "divide") else 0.0
+    name, other = "in1", value_of(node, "in2", intake)
+    if operation in ("multiply", "add") and value_of(node, "in1", intake) is not None:
+        name, other = "in2", value_of(node, "in1", intake)
+    elif other is None and node.GetInput("in2") and node.GetInput("in2").HasConnectedSource():
+        return None, name
+    values = _vector(other, (identity, identity))
+    with np.errstate(divide="ignore"):
+        if operation in ("multiply", "divide"):
+            return np.diag([*(values if operation == "multiply" else 1.0 / values), 1.0]), name
+    return _shift(*(values if operation == "add" else -values)), name
+
+
+def _step_none(node: UsdShade.Shader, intake: Intake):
+    return np.eye(3), "in"
+
+
+_STEPS = {
+    "UsdTransform2d": _step_transform,
+    "place2d": _step_place,
+    "rotate2d": _step_rotate,
+    "multiply": _step_arithmetic,
+    "divide": _step_arithmetic,
+    "add": _step_arithmetic,
+    "subtract": _step_arithmetic,
+    "convert": _step_none,
+    "dot": _step_none,
+    "swizzle": _step_none,
+}
 
 
 def _vector(value, default: tuple[float, ...]) -> np.ndarray:
