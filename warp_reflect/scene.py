@@ -14,6 +14,7 @@ from functools import cached_property
 import numpy as np
 import warp as wp
 
+from warp_reflect.baked_maps import BakedMap
 from warp_reflect.bodies import Body, analyse, weld
 
 wp.set_module_options({"enable_backward": False})
@@ -206,6 +207,8 @@ class SceneData:
     time_codes_per_second: float = 24.0
     collections: dict[str, tuple[str, ...]] = field(default_factory=dict)  # "/Prim.collection:name" to member paths
     environment_maps: list[EnvironmentMapData] = field(default_factory=list)
+    # By the path of the prim or GeomSubset that carries them; not compared with the geometry yet.
+    baked_maps: dict[str, tuple[BakedMap, ...]] = field(default_factory=dict)
     # Textures that were read with the stage, by `textures.picture_key`, float32 [h, w, 1 or 3]; None: read from files
     # when they are needed.
     pictures: dict[str, np.ndarray] | None = None

@@ -19,6 +19,7 @@ from warp_reflect.stage.intake import Intake, library_message  # before pxr: set
 from pxr import Sdf, Tf, Usd, UsdGeom, UsdUtils  # isort: skip
 
 from warp_reflect.stage.assemble import Assembly, MeshEntry
+from warp_reflect.stage.baked import read_baked_maps
 from warp_reflect.stage.lights import SHADED_KINDS, default_dome
 from warp_reflect.stage.materialx import is_materialx_error
 from warp_reflect.stage.reflectors import Choices, choose_reflectors, parse_patterns
@@ -136,6 +137,7 @@ class StageReader:
         data.environment_maps = walk.environment_maps
         Assembly(intake, self.level, choices, self._static).complete(data, walk.drawn, placed)
         choose_reflectors(data, choices)
+        data.baked_maps = read_baked_maps(walk.drawn, intake)
         if not data.instances:
             intake.note("/", "the stage holds no geometry that can be drawn")
         if not any(light.kind in SHADED_KINDS for light in data.lights):

@@ -81,6 +81,8 @@ def check(data: SceneData) -> None:
         if light.texture is not None:
             good = good and light.texture.ndim == 3 and light.texture.shape[2] == 3
         _require(good and bool(np.isfinite(light.color).all()), f"light {light.path}")
+    for path, maps in data.baked_maps.items():
+        _require(not any(each.fault() for each in maps), f"baked map of {path}")
     textured = any(material.textures for material in data.materials)
     _require(data.pictures is not None or not textured, "no pictures")  # this process is not to open them
     for key, picture in (data.pictures or {}).items():

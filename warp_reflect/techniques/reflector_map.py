@@ -20,7 +20,7 @@ from warp_reflect.layers import Camera, CameraView, GBuffer, MirrorPixels, Refle
 from warp_reflect.reflector_maps import ReflectorMap, ReflectorMapView
 from warp_reflect.scene import PartRange, Scene
 from warp_reflect.settings import Settings, Technique
-from warp_reflect.techniques import forward, grid
+from warp_reflect.techniques import baking, forward, grid
 from warp_reflect.techniques.forward import SolveFrame, VertexView
 from warp_reflect.techniques.map_search import SearchSettings, is_visible, search_settings, solve_vertex
 
@@ -145,17 +145,23 @@ def prepare(scene: Scene, reflector: Reflector, settings: Settings) -> Prepared:
     part = scene.parts[reflector.part]
     points, faces, normals = part_mesh(scene, part)
     polish = _Polish(scene, part) if any(scene.patch_shapes[k] is not None for k in part.patches) else None
-    drawn = ReflectorMap.from_mesh(
-        points,
-        faces,
-        settings.map_resolution,
-        normals=normals,
-        polish=polish,
-        body=scene.body(reflector.part),
-        device=scene.device,
+    resolution, body = settings.map_resolution, scene.body(reflector.part)
+    drawn = baking.baked_or_drawn(
+        scene,
+        part,
+        (points, faces, normals),
+        resolution,
+        lambda: ReflectorMap.from_mesh(
+            points, faces, resolution, normals=normals, polish=polish, body=body, device=scene.device
+        ),
     )
     cells = grid.build(scene, part, settings.grid_share) if settings.grid_share > 0.0 else None
     return Prepared(reflector, drawn, drawn.unit_from_body, cells)
+
+
+def drawn_maps(prepared: Prepared) -> list[ReflectorMap]:
+    """The maps of a mirror, in the order of its pieces."""
+    return [prepared.map]
 
 
 class _Polish:
