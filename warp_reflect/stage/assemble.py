@@ -8,11 +8,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from pxr import Tf, UsdGeom, UsdLux
 
-from warp_reflect.scene import CameraData, InstanceData, MeshData, Note, SceneData
+from warp_reflect.scene import CameraData, InstanceData, MaterialData, MeshData, Note, SceneData
 from warp_reflect.stage.cameras import default_camera
 from warp_reflect.stage.detail import pixels_across, subdivision_level
 from warp_reflect.stage.geometry import SMOOTH_SCHEMES, read_gprim, read_mesh, subdivision_scheme
 from warp_reflect.stage.intake import BadPrim, Intake, floats, library_message, transform_fault
+from warp_reflect.stage.lights import mesh_light_radiance
 from warp_reflect.stage.materials import MaterialTable, Surface
 from warp_reflect.stage.reflectors import Choices, may_reflect, part_names
 
@@ -105,6 +106,8 @@ class Assembly:
                 chosen = tuple(
                     materials.of_prim(prim, prim.GetChild(name) if name else None, colored) for name in entry.subsets
                 )
+                if prim.HasAPI(UsdLux.MeshLightAPI):
+                    chosen = self._glowing(prim, entry.mesh, worlds[index][0], materials.materials) or chosen
                 parts[index] = mesh_index, chosen
         for instance in placed:
             if instance.mesh in parts:
@@ -142,11 +145,26 @@ class Assembly:
         self.meshes.append(entry.mesh)
         return len(self.meshes) - 1, entry, color_name
 
+    def _glowing(self, prim, mesh: MeshData, world: np.ndarray, materials: list[MaterialData]) -> tuple[int, ...]:
+        """Materials per part of a mesh whose light replaces its material; empty where it keeps that."""
+        corners = mesh.points[mesh.triangles].astype(np.float64) @ world[:3, :3].T
+        sides = corners[:, 1:] - corners[:, :1]
+        area = 0.5 * float(np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1).sum())
+        try:
+            radiance = mesh_light_radiance(prim, area, self.intake)
+        except BadPrim as fault:
+            self.intake.bad(prim.GetPath(), f"{fault}; it does not glow")
+            return ()
+        if radiance is None:
+            return ()
+        materials.append(MaterialData(str(prim.GetPath()), (0.0,) * 3, roughness=1.0, ior=1.0, emissive=radiance))
+        return (len(materials) - 1,) * max(len(mesh.parts), 1)
+
     def _read(self, prim, level: int, uv_name: str, color_name: str) -> MeshEntry:
         if prim.HasRelationship("skel:skeleton") or prim.HasAttribute("primvars:skel:jointIndices"):
             self.intake.note(prim.GetPath(), "skeletal skinning is not applied: drawn in its rest pose")
         if prim.HasAPI(UsdLux.MeshLightAPI):
-            self.intake.note(prim.GetPath(), "MeshLightAPI: the mesh is drawn but does not light the scene")
+            self.intake.note(prim.GetPath(), "MeshLightAPI: the mesh is seen to glow but does not light the scene")
         if prim.GetTypeName() == "Mesh":
             mesh, subsets = read_mesh(prim, self.intake, level, uv_name, color_name)
             return MeshEntry(mesh, [subset.GetName() if subset else "" for subset in subsets], [])

@@ -23,7 +23,13 @@ SHAPES = {
     "DiskLight": ("disk", ("radius",)),
     "CylinderLight": ("cylinder", ("length", "radius")),
 }
-SHAPING = ("cone:angle", "cone:softness", "focus", "ies:file")
+# Authored, these change how a light shines and are not simulated: noted.
+UNUSED = ("shaping:cone:angle", "shaping:cone:softness", "shaping:focus", "shaping:ies:file", "diffuse", "specular")
+LINKS = ("collection:lightLink:includes", "collection:lightLink:excludes", "collection:shadowLink:excludes")
+LAYOUTS = ("latlong", "mirroredBall", "angular", "cubeMapVerticalCross")
+# Width over height of the layouts that a picture's shape gives away; a square is a light probe's.
+ASPECTS = {2.0: "latlong", 0.75: "cubeMapVerticalCross", 1.0: "angular"}
+ASPECT_ROUNDING = 0.02  # pictures a few pixels off their shape
 # A pole along the light's +Z instead of +Y: a quarter turn about x.
 Z_POLE = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 RESAMPLED_ROWS_MAX = 1024  # rows of a latlong map made from another layout
@@ -59,10 +65,12 @@ def read_light(prim, world_from_light: np.ndarray, up_axis: str, intake: Intake)
     radiance = _emission(prim, intake)
     path = str(prim.GetPath())
     normalized = bool(UsdLux.LightAPI(prim).GetNormalizeAttr().Get(intake.time))
-    for name in SHAPING:
-        attribute = prim.GetAttribute(f"inputs:shaping:{name}")
-        if attribute and attribute.HasAuthoredValue():
-            intake.note(path, f"inputs:shaping:{name} is not used")
+    for name in UNUSED:
+        attribute = prim.GetAttribute(f"inputs:{name}")
+        if attribute and attribute.HasAuthoredValue() and attribute.Get(intake.time) != 1.0:
+            intake.note(path, f"inputs:{name} is not used")
+    if any(link and link.HasAuthoredTargets() for link in map(prim.GetRelationship, LINKS)):
+        intake.note(path, "light linking is not used: it lights everything")
     if kind in DOMES:
         if kind == "DomeLight_1":
             pole = prim.GetAttribute("poleAxis").Get(intake.time)
@@ -83,6 +91,9 @@ def read_light(prim, world_from_light: np.ndarray, up_axis: str, intake: Intake)
     texture = prim.GetAttribute("inputs:texture:file")
     if texture and texture.HasAuthoredValue():
         intake.note(path, "inputs:texture:file is not used")
+    point = prim.GetAttribute("treatAsPoint")
+    if point and point.Get(intake.time):
+        intake.note(path, "treatAsPoint is not used: it shines as the sphere it is")
     return LightData(path, shape, radiance, world_from_light, size=size)
 
 
@@ -107,6 +118,26 @@ def world_area(shape: str, size: tuple[float, ...], world_from_light: np.ndarray
     ratio = ((y - z) / (y + z)) ** 2
     perimeter = np.pi * (y + z) * (1.0 + 3.0 * ratio / (10.0 + np.sqrt(4.0 - 3.0 * ratio)))
     return float(size[0] * x * size[1] * perimeter)
+
+
+def mesh_light_radiance(prim, area: float, intake: Intake) -> tuple[float, float, float] | None:
+    """Radiance of a mesh with MeshLightAPI where its light replaces its material; None where the material glows.
+
+    Args:
+        prim: The mesh.
+        area: Of its surface in world space, which `normalize` divides by.
+        intake: The reading.
+
+    Raises:
+        BadPrim: a value that is no number or below zero.
+
+    Source: UsdLuxLightAPI's materialSyncMode: "noMaterialResponse" draws the light's colour alone; in the other modes
+    what is seen is the material's own emission.
+    """
+    if prim.GetAttribute("light:materialSyncMode").Get(intake.time) != "noMaterialResponse":
+        return None
+    radiance = _emission(prim, intake)
+    return _times(radiance, 1.0 / area) if UsdLux.LightAPI(prim).GetNormalizeAttr().Get(intake.time) else radiance
 
 
 def default_dome() -> LightData:
@@ -162,8 +193,23 @@ def _dome_texture(prim, intake: Intake) -> np.ndarray | None:
                 prim.GetPath(),
                 f"inputs:texture:file: {picture.cleaned} samples below 0 or not finite set to 0",
             )
-        intake.cache[key] = latlong(picture.rgb, layout)
+        intake.cache[key] = latlong(picture.rgb, _layout(prim, layout, picture.rgb.shape, intake))
     return intake.cache[key]
+
+
+def _layout(prim, layout: str, shape: tuple[int, ...], intake: Intake) -> str:
+    """The layout of a dome's picture; one that is not given is guessed by the picture's shape."""
+    if layout in LAYOUTS:
+        return layout
+    label = "inputs:texture:format"
+    aspect = shape[1] / shape[0]
+    found = next((name for a, name in ASPECTS.items() if abs(aspect / a - 1.0) <= ASPECT_ROUNDING), LAYOUTS[0])
+    told = f"a picture of {shape[1]} by {shape[0]} pixels is taken as {found}"
+    if layout != "automatic":
+        intake.bad(prim.GetPath(), f"{label}: got {layout!r}, expected automatic, {', '.join(LAYOUTS)}; {told}")
+    elif abs(aspect / 2.0 - 1.0) > ASPECT_ROUNDING:
+        intake.note(prim.GetPath(), f"{label}: automatic: {told}")
+    return found
 
 
 def latlong(picture: np.ndarray, layout: str) -> np.ndarray:
@@ -175,9 +221,9 @@ def latlong(picture: np.ndarray, layout: str) -> np.ndarray:
 
     Args:
         picture: float32 [h, w, 3].
-        layout: "automatic" and "latlong" are returned as they are.
+        layout: One of `LAYOUTS`; "latlong" is returned as it is.
     """
-    if layout not in ("mirroredBall", "angular", "cubeMapVerticalCross"):
+    if layout == "latlong":
         return picture
     side = picture.shape[0] // 4 if layout == "cubeMapVerticalCross" else picture.shape[0] // 2
     rows = int(np.clip(2 * side, 2, RESAMPLED_ROWS_MAX))
