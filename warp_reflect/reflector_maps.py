@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 
 from warp_reflect.baked_maps import BakedMap
-from warp_reflect.bodies import CLOSING_POWER, Sheet, analyse, weld
+from warp_reflect.bodies import Sheet, analyse, weld
 from warp_reflect.cubemap import FACE_COUNT, cube_point, face_axes, node_directions
 from warp_reflect.launch import launch
 from warp_reflect.layers import CameraView
@@ -160,7 +160,7 @@ class ReflectorMap:
 
         A point has a reflection on an open convex mesh if and only if its reflection on any convex body that holds the
         mesh on its surface falls on the mesh (the path length is convex): so the closing part may have any convex shape.
-        This one continues the tangent planes of the rim, so that nothing bends there, and is round beyond.
+        This one continues the tangent planes of the rim, so that nothing bends there, and ends in a box.
 
         Args:
             points: Float [vertex_count, 3].
@@ -207,7 +207,10 @@ class ReflectorMap:
         view.outer_radius = outer
         view.least_curvature = float(extent.min() / extent.max() ** 2)
         view.greatest_curvature = float(extent.max() / extent.min() ** 2)
+        closed = bool((texels[..., 3] > 0.0).all())
+        view.accepted = CLOSED_ACCEPTED if closed else OPEN_ACCEPTED
         return cls(texels, unit_from_body, extent, inner, outer, view)
+
 
 
 def _draw(cls, points, faces, normals, centre, axes, extent, resolution, polish, device, rim=None) -> ReflectorMap:
@@ -253,7 +256,7 @@ def _draw(cls, points, faces, normals, centre, axes, extent, resolution, polish,
 
 
 RIM_PLANES = 160  # at most so many tangent planes close an open reflector
-BLEND_POWER = 8.0
+PLANE_COS_MIN = 1.0e-6  # of a ray and a plane's normal below which they do not meet
 
 
 def _rim(points: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -269,30 +272,20 @@ def _rim(points: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> tuple[np
 
 
 def _close(directions, rim_points, rim_normals, extent) -> tuple[np.ndarray, np.ndarray]:
-    """Where rays from 0 leave the companion: the rim's tangent planes, blended into the superellipsoid that closes it.
-
-    The gauge is (g_planes^q + g_closing^q)^(1/q): convex as a norm of convex gauges, and without an edge for a search to
-    stumble over; at the rim, where g_closing is at most `CLOSING_GAUGE`, it differs from the planes' by 0.4 %.
-    """
-    heights = np.einsum("ij,ij->i", rim_normals, rim_points)
-    planes = rim_normals[heights > 0.0] / heights[heights > 0.0, None]
-    x = np.abs(directions) / extent
-    total = (x**CLOSING_POWER).sum(axis=1)
-    closing = total ** (1.0 / CLOSING_POWER)
-    gradient = np.sign(directions) * x ** (CLOSING_POWER - 1.0) / extent
-    gradient *= (total ** (1.0 / CLOSING_POWER - 1.0))[:, None]
-    flat, plane = np.zeros(len(directions)), np.zeros_like(directions)
-    if len(planes):
-        for first in range(0, len(directions), 8192):
-            block = slice(first, first + 8192)
-            towards = directions[block] @ planes.T
-            nearest = towards.argmax(axis=1)
-            flat[block] = np.maximum(towards[np.arange(len(nearest)), nearest], 0.0)
-            plane[block] = planes[nearest]
-    gauge = (flat**BLEND_POWER + closing**BLEND_POWER) ** (1.0 / BLEND_POWER)
-    normal = plane * (flat ** (BLEND_POWER - 1.0))[:, None] + gradient * (closing ** (BLEND_POWER - 1.0))[:, None]
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    return directions / gauge[:, None], normal
+    """Where rays from 0 leave the companion: the nearest of the rim's tangent planes and the sides of the box."""
+    sides = np.concatenate([np.eye(3), -np.eye(3)])
+    planes = np.concatenate([rim_normals, sides])
+    heights = np.concatenate([np.einsum("ij,ij->i", rim_normals, rim_points), extent, extent])
+    planes, heights = planes[heights > 0.0], heights[heights > 0.0]
+    position, normal = np.empty_like(directions), np.empty_like(directions)
+    for first in range(0, len(directions), 8192):
+        block = slice(first, first + 8192)
+        towards = directions[block] @ planes.T
+        distance = np.where(towards > PLANE_COS_MIN, heights / np.maximum(towards, PLANE_COS_MIN), np.inf)
+        nearest = distance.argmin(axis=1)
+        position[block] = directions[block] * distance[np.arange(len(nearest)), nearest][:, None]
+        normal[block] = planes[nearest]
+    return position, normal
 
 
 def _smooth_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
