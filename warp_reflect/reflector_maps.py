@@ -207,10 +207,7 @@ class ReflectorMap:
         view.outer_radius = outer
         view.least_curvature = float(extent.min() / extent.max() ** 2)
         view.greatest_curvature = float(extent.max() / extent.min() ** 2)
-        closed = bool((texels[..., 3] > 0.0).all())
-        view.accepted = CLOSED_ACCEPTED if closed else OPEN_ACCEPTED
         return cls(texels, unit_from_body, extent, inner, outer, view)
-
 
 
 def _draw(cls, points, faces, normals, centre, axes, extent, resolution, polish, device, rim=None) -> ReflectorMap:
