@@ -613,6 +613,55 @@ def test_other_times_share_what_does_not_move(stage):
     assert [d.meshes[1].points[0, 2] for d in (first, middle)] == [0.0, 2.0]
 
 
+def test_topology_that_changes_in_time_is_not_interpolated(stage):
+    mesh = samples.add_mesh(stage, "/Mesh", samples.QUAD_POINTS, [4], [0, 1, 2, 3])
+    mesh.GetPointsAttr().Clear()
+    mesh.GetPointsAttr().Set([Gf.Vec3f(*map(float, p)) for p in samples.QUAD_POINTS], 1.0)
+    mesh.GetPointsAttr().Set([Gf.Vec3f(*map(float, p)) for p in samples.CUBE_POINTS], 3.0)
+    mesh.GetPointsAttr().Set([], 5.0)
+    for attribute, first, second in (
+        (mesh.GetFaceVertexCountsAttr(), [4], [4] * 6),
+        (mesh.GetFaceVertexIndicesAttr(), [0, 1, 2, 3], samples.CUBE_INDICES),
+    ):
+        attribute.Clear()
+        for time, value in ((1.0, first), (3.0, second), (5.0, [])):
+            attribute.Set(value, time)
+    scene = load_stage(samples.saved(stage))
+    counts = [(len(m.triangles), len(m.points)) for t in (1.0, 2.0, 3.0, 4.0) for m in scene.at(t).data.meshes]
+    assert counts == [(2, 4), (2, 4), (12, 8), (12, 8)]
+    gone = scene.at(5.0)
+    assert not gone.data.instances and gone.triangle_count == 0
+    assert any("/Mesh: points: got an empty array" in text for text in texts(gone.data))
+    assert scene.at(1.0).triangle_count == 2  # and back
+
+
+def test_visibility_and_gprims_change_in_time(stage):
+    blink = samples.add_quad(stage, "/Group/Blink")
+    group = UsdGeom.Imageable(stage.GetPrimAtPath("/Group"))
+    UsdGeom.Xform.Define(stage, "/Group")
+    group.CreateVisibilityAttr().Set("invisible", 2.0)
+    group.GetVisibilityAttr().Set("inherited", 1.0)
+    ball = UsdGeom.Sphere.Define(stage, "/Ball")
+    ball.CreateRadiusAttr().Set(1.0, 1.0)
+    ball.GetRadiusAttr().Set(3.0, 3.0)
+    reader = StageReader(samples.saved(stage))
+    seen = {t: reader.read(t) for t in (1.0, 2.0)}
+    assert [[i.prim_path for i in d.instances] for d in seen.values()] == [[str(blink.GetPath()), "/Ball"], ["/Ball"]]
+    assert [d.meshes[-1].points.max() for d in seen.values()] == pytest.approx([1.0, 2.0])
+
+
+def test_notes_are_one_line_each_and_told_at_every_time(stage):
+    samples.add_mesh(stage, "/Bad", [(0, 0, 0), (1, NAN, 0), (1, 1, 0)], [3], [0, 1, 2])
+    samples.add_quad(stage, "/Holed").CreateHoleIndicesAttr([7])
+    stage.OverridePrim("/Lost").GetReferences().AddReference("./nowhere.usda")
+    UsdGeom.BasisCurves.Define(stage, "/Curves")
+    reader = StageReader(samples.saved(stage))
+    first, second = reader.read(1.0), reader.read(2.0)
+    assert first.notes == second.notes and len(first.notes) == len(set(first.notes))
+    assert {"/Bad", "/Holed", "/Lost", "/Curves"} <= {note.path for note in first.notes}
+    assert not any("\n" in note.text for note in first.notes)
+
+
 def test_changed_file_is_read_anew(stage, tmp_path):
     samples.add_quad(stage, "/Quad")
     path = samples.saved(stage)
@@ -626,9 +675,76 @@ def test_changed_file_is_read_anew(stage, tmp_path):
 
 def test_what_is_met_and_not_drawn_is_noted_once(stage):
     UsdGeom.BasisCurves.Define(stage, "/Curves")
-    UsdGeom.Points.Define(stage, "/Points")
+    UsdGeom.NurbsPatch.Define(stage, "/Patch")
     data = read(stage)
-    assert [text.split(":")[0] for text in texts(data) if "is not drawn" in text] == ["/Curves", "/Points"]
+    assert [text.split(":")[0] for text in texts(data) if "is not drawn" in text] == ["/Curves", "/Patch"]
+
+
+def add_points(stage, centres, widths=None):
+    points = UsdGeom.Points.Define(stage, "/Points")
+    points.CreatePointsAttr([Gf.Vec3f(*map(float, centre)) for centre in centres])
+    if widths is not None:
+        points.CreateWidthsAttr(widths)
+    return points
+
+
+def test_points_are_balls_of_their_widths(stage):
+    centres, widths = [(0, 0, 0), (5, 0, 0), (0, 7, -3)], [2.0, 1.0, 0.5]
+    points = add_points(stage, centres, widths)
+    points.CreateDisplayColorPrimvar("vertex").Set([Gf.Vec3f(1, 0, 0), Gf.Vec3f(0, 1, 0), Gf.Vec3f(0, 0, 1)])
+    points.AddTranslateOp().Set(Gf.Vec3d(0, 0, 9))
+    data = read(stage)
+    mesh, (instance,) = data.meshes[0], data.instances
+    assert instance.prim_path == "/Points" and instance.world_from_object[2, 3] == 9.0
+    corners = mesh.points[mesh.triangles].astype(float)
+    ball = np.linalg.norm(corners[:, :1] - np.array(centres), axis=2).argmin(axis=1)
+    out = corners - np.array(centres)[ball][:, None]
+    np.testing.assert_allclose(
+        np.linalg.norm(out, axis=2), 0.5 * np.array(widths)[ball][:, None] * np.ones(3), rtol=1e-5
+    )
+    unit = out / np.linalg.norm(out, axis=2, keepdims=True)
+    np.testing.assert_allclose(mesh.normals[mesh.normal_index], unit, atol=1e-5)
+    facing = np.einsum("nk,nk->n", np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), out[:, 0])
+    assert (facing > 0.0).all()
+    np.testing.assert_array_equal(mesh.colors[mesh.color_index], np.eye(3)[ball][:, None] * np.ones((1, 3, 1)))
+    # Closed and inscribed: a little less than the spheres' volume.
+    volume = np.einsum("nk,nk->n", out[:, 0], np.cross(out[:, 1], out[:, 2])).sum() / 6.0
+    assert 0.96 < volume / (np.pi / 6.0 * np.sum(np.array(widths) ** 3)) < 1.0
+
+
+def test_points_without_widths_have_a_diameter_of_one(stage):
+    add_points(stage, [(1, 2, 3)])
+    data = read(stage)
+    assert np.ptp(data.meshes[0].points, axis=0) == pytest.approx(np.ones(3), abs=0.06)
+    assert "/Points: widths: no value; 1 is used" in texts(data)
+
+
+@pytest.mark.parametrize("count", [900, 2_000, 60_000])
+def test_many_points_stay_affordable(stage, count):
+    points = UsdGeom.Points.Define(stage, "/Points")
+    points.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(np.random.default_rng(1).random((count, 3), np.float32)))
+    points.CreateWidthsAttr([0.01])
+    data = read(stage)
+    assert 20 * count <= len(data.meshes[0].triangles) <= max(320 * 1_000, 80 * 50_000)
+
+
+def test_bad_points_are_left_out_and_told(stage):
+    add_points(stage, [(0, 0, 0), (NAN, 0, 0), (2, 0, 0), (3, 0, 0), (4, 0, 0)], [1.0, 1.0, -1.0, 0.0, 1.0])
+    data = read(stage)
+    assert len(data.meshes[0].triangles) == 2 * 320
+    assert any("/Points: points[1]: got (nan" in text for text in texts(data))
+    assert any("/Points: widths[2]: got -1" in text for text in texts(data))
+
+
+@pytest.mark.parametrize(
+    ("centres", "widths", "message"),
+    [([], None, "points: got an empty array"), ([(0, 0, 0)] * 3, [1.0, 2.0], "widths: got 2 values, expected 1 or 3")],
+)
+def test_points_that_cannot_be_drawn_are_dropped(stage, centres, widths, message):
+    add_points(stage, centres, widths)
+    data = read(stage)
+    assert not data.instances
+    assert any(text.startswith(f"/Points: {message}") and text.endswith("prim dropped") for text in texts(data))
 
 
 @pytest.mark.parametrize("arguments", [{"purposes": ("all",)}, {"complexity": "extreme"}, {"time": NAN}])

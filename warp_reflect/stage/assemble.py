@@ -15,6 +15,7 @@ from warp_reflect.stage.geometry import SMOOTH_SCHEMES, read_gprim, read_mesh, s
 from warp_reflect.stage.intake import BadPrim, Intake, floats, library_message, transform_fault
 from warp_reflect.stage.lights import mesh_light_radiance
 from warp_reflect.stage.materials import MaterialTable, Surface
+from warp_reflect.stage.points import read_points
 from warp_reflect.stage.reflectors import Choices, may_reflect, part_names
 
 DISPLAY_COLOR = "displayColor"
@@ -170,6 +171,8 @@ class Assembly:
             return MeshEntry(mesh, [subset.GetName() if subset else "" for subset in subsets], [])
         if uv_name:
             self.intake.note(prim.GetPath(), f"{prim.GetTypeName()} has no texture coordinates: textures not used")
+        if prim.GetTypeName() == "Points":
+            return MeshEntry(read_points(prim, self.intake, level, color_name), [""], [])
         return MeshEntry(read_gprim(prim, self.intake, level), [""], [])
 
     def _cage_box(self, prim) -> Box | None:

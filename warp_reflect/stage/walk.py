@@ -15,7 +15,8 @@ from warp_reflect.stage.lights import read_light
 from warp_reflect.stage.reflectors import Choices
 from warp_reflect.stage.schema import ENVIRONMENT_MAP_API, MIRROR_API, applied, read_environment_map, read_mirror
 
-ANALYTIC = frozenset(("Sphere", "Cube", "Cylinder", "Cylinder_1", "Cone", "Capsule", "Capsule_1", "Plane"))
+ANALYTIC = ("Sphere", "Cube", "Cylinder", "Cylinder_1", "Cone", "Capsule", "Capsule_1", "Plane")
+DRAWN = frozenset(("Mesh", "Points", *ANALYTIC))
 
 
 @dataclass(frozen=True)
@@ -135,7 +136,7 @@ class Walk:
             self._camera(prim, state)
         elif not state.visible or state.purpose not in self.purposes:
             pass
-        elif kind == "Mesh" or kind in ANALYTIC:
+        elif kind in DRAWN:
             self._geometry(prim, state, found)
         elif prim.IsA(UsdGeom.PointInstancer):
             self._instancer(prim, state, found)
