@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 import logging
 import queue
 import signal
@@ -17,7 +18,7 @@ import uuid
 from collections.abc import Callable, Iterator
 
 from warp_reflect.launch import CORES_VARIABLE, thread_count
-from warp_reflect.pipeline import FRAME_FAILURES, Job, OpenJob, Outcome, one_line, render_places
+from warp_reflect.pipeline import FRAME_FAILURES, REUSE_RUN, Job, OpenJob, Outcome, one_line, render_places
 from warp_reflect.progress import Report
 
 SCHEDULER_SECONDS = 10.0  # how long a scheduler may take to answer
@@ -62,7 +63,7 @@ def render_on_cluster(
             workers = max(len(client.scheduler_info(n_workers=-1)["workers"]), 1)
         stop = distributed.Event(run, client=client)
         events: queue.SimpleQueue = queue.SimpleQueue()
-        client.subscribe_topic(run, lambda event: events.put(event[1]))
+        client.subscribe_topic(run, lambda event: events.put(event[1]["outcome"]))
         stack.callback(client.unsubscribe_topic, run)
 
         def submit(batch: list[int]) -> None:
@@ -75,8 +76,8 @@ def render_on_cluster(
         size = min(BATCH_MAX, -(-len(places) // (BATCHES_PER_WORKER * workers)))
         waiting: dict = {}
         told: set[int] = set()
-        for k in range(0, len(places), size):
-            submit(places[k : k + size])
+        for batch in _batches(job, places, size):
+            submit(batch)
         while waiting:
             with contextlib.suppress(queue.Empty):
                 outcome = _from_plain(events.get(timeout=POLL_SECONDS))
@@ -109,6 +110,13 @@ def render_on_cluster(
                     if outcome.place not in told:
                         told.add(outcome.place)
                         yield outcome
+
+
+def _batches(job: Job, places: list[int], size: int) -> list[list[int]]:
+    """Consecutive frames in lots of a size; what reuses from frame to frame is cut only where that starts afresh."""
+    if not job.reuses:
+        return [places[k : k + size] for k in range(0, len(places), size)]
+    return [list(run) for _, run in itertools.groupby(places, key=lambda place: place // REUSE_RUN)]
 
 
 @contextlib.contextmanager
@@ -178,13 +186,13 @@ def render_batch(
         whole = dict(zip(local, places, strict=True))
         for outcome in render_places(job, local, digest, opened, resume, stop.is_set, deadline):
             done.append(dataclasses.asdict(dataclasses.replace(outcome, place=whole[outcome.place])))
-            worker.log_event(run, done[-1])
+            worker.log_event(run, {"outcome": done[-1]})
     return done
 
 
 def _opened(worker, job: Job, digest: str) -> list[OpenJob]:
     """What a worker holds open, kept on the worker from batch to batch of one job."""
-    same = dataclasses.replace(job, times=(), files=()), digest
+    same = dataclasses.replace(job, times=(), files=(), numbers=()), digest
     known = getattr(worker, "warp_reflect_opened", None)
     if known is None or known[0] != same:
         known = worker.warp_reflect_opened = (same, [])

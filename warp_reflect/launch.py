@@ -16,7 +16,8 @@ from functools import cache, partial
 import warp as wp
 
 SPLIT_MIN = 4096  # elements below which the hand-off (20-60 us) costs more than the second thread saves
-# Environment variable: the cores that `threads=0` means, where several processes share a machine.
+# Environment variable: the most threads of a launch where `threads` is 0, for processes that share a machine. It cuts
+# launches, it plans nothing: a frame's plan is the same in all of them.
 CORES_VARIABLE = "WARP_REFLECT_THREADS"
 CPU_BLOCK_DIM = 1  # what Warp launches with on the CPU
 SLICE_ALIGN = 64  # elements; slices that share a cache line of 4-byte results would ping-pong it
@@ -33,15 +34,15 @@ def thread_count(device, threads: int = 0) -> int:
         return 1
     if threads > 0:
         return threads
-    allowed = os.environ.get(CORES_VARIABLE, "")
-    if allowed.isdecimal() and int(allowed) > 0:
-        return int(allowed)
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def slice_length(count: int, device, threads: int = 0, split_min: int = SPLIT_MIN) -> int:
     """Elements of every slice but the last of a launch over `count` elements (all of them where it is not split)."""
     parts = thread_count(device, threads)
+    allowed = os.environ.get(CORES_VARIABLE, "") if threads == 0 else ""
+    if allowed.isdecimal() and int(allowed) > 0:
+        parts = min(parts, int(allowed))
     if parts == 1 or count < split_min:
         return count
     step = -(-count // parts)

@@ -36,6 +36,8 @@ DONE, PART_WAY, IMPOSSIBLE = 0, 1, 2
 FRAME_FAILURES = (ValueError, LookupError, ArithmeticError, OSError, RuntimeError, MemoryError)
 # How a stage is opened that says nothing about what its frames show.
 NOT_SEEN = ("device", "strict", "untrusted", "root")
+# Frames after which what is reused from frame to frame (`reuse_px`) starts afresh, so that a frame depends on few others.
+REUSE_RUN = 16
 RECENT = 3  # frames that the time of the next one is judged by
 SLACK = 1.1  # of that judgement: frames of a range differ
 SIDE_MAX = 32768  # pixels; what the image readers of this package accept back
@@ -57,6 +59,7 @@ class Job:
         method: See `make_plan`.
         channels: Of an EXR; None: all.
         multi_part: EXR of one part per channel group.
+        numbers: The frames' places in the whole range; empty: this is the whole range.
         folder: What relative names are relative to.
         snapshot: Where a picture of the last finished frame is written when asked for by a signal.
     """
@@ -72,6 +75,7 @@ class Job:
     method: str = "auto"
     channels: tuple[str, ...] | None = None
     multi_part: bool = False
+    numbers: tuple[int, ...] = ()
     folder: str = field(default_factory=os.getcwd)
     snapshot: str = "snapshot.png"
 
@@ -81,18 +85,38 @@ class Job:
         return self.stage if time_code is None else f"frame {time_code:g}"
 
     def cut(self, places: list[int]) -> tuple[Job, list[int]]:
-        """The same job with nothing but some of its frames and those right before them, and their places in it."""
-        kept = sorted({each for place in places for each in (max(place - 1, 0), place)})
+        """The same job with nothing but some of its frames and those they depend on, and their places in it."""
+        kept = sorted({each for place in places for each in range(self.first_needed(place), place + 1)})
         at = {place: k for k, place in enumerate(kept)}
-        times, files = tuple(self.times[k] for k in kept), tuple(self.files[k] for k in kept)
-        return dataclasses.replace(self, times=times, files=files), [at[place] for place in places]
+        part = dataclasses.replace(
+            self,
+            times=tuple(self.times[k] for k in kept),
+            files=tuple(self.files[k] for k in kept),
+            numbers=tuple(self.numbers[k] if self.numbers else k for k in kept),
+        )
+        return part, [at[place] for place in places]
+
+    def starts_run(self, place: int) -> bool:
+        """Whether nothing is reused from the frame before."""
+        return not self.reuses or (self.numbers[place] if self.numbers else place) % REUSE_RUN == 0
+
+    def first_needed(self, place: int) -> int:
+        """The first of the frames that a frame depends on: itself, the one before, or all of its run and one more."""
+        while place and not self.starts_run(place):
+            place -= 1
+        return max(place - 1, 0) if self.looks_back else place
 
     @property
     def looks_back(self) -> bool:
-        """Whether a frame depends on the one before: through its motion channel."""
+        """Whether a frame depends on the one before: through its motion channel, or by reusing what that one found."""
         data = any(name.lower().endswith(".exr") for name in self.files[0])
         asked = self.channels is None or any(name.startswith("reflectionMotion") for name in self.channels)
-        return data and asked
+        return self.reuses or (data and asked)
+
+    @property
+    def reuses(self) -> bool:
+        """Whether frames start from what the ones before found."""
+        return self.settings.reuse_px > 0.0
 
 
 @dataclass(frozen=True)
@@ -146,14 +170,19 @@ class OpenJob:
 
     def render(self, place: int) -> wr.Frame:
         """A frame; the one before it is given to it where it looks back, and rendered first where it is not at hand."""
-        previous = None
-        if place and self.job.looks_back:
-            at_hand = self._last is not None and self._last[0] == self.job.times[place - 1]
-            previous = self._last[1] if at_hand else self._draw(place - 1, None)
+        previous = self._before(place) if place and self.job.looks_back else None
         self._last = None  # so that two frames are held at most, not three
         frame = self._draw(place, previous)
         self._last = (self.job.times[place], frame)
         return frame
+
+    def _before(self, place: int) -> wr.Frame:
+        """The frame before, as a frame takes it: at the start of a run with nothing that it reused itself."""
+        starts, last = self.job.starts_run(place), self._last
+        if last is not None and last[0] == self.job.times[place - 1] and not (self.job.reuses and starts):
+            return last[1]
+        self._last = None
+        return self._draw(place - 1, None) if starts else self.render(place - 1)
 
     def _draw(self, place: int, previous: wr.Frame | None) -> wr.Frame:
         plan = self.plan_at(place)
