@@ -289,7 +289,7 @@ def _read_surface(shader: UsdShade.Shader, parameters, path: str, intake: Intake
 
 
 def _read_opacity(shader, values: dict, textures: dict, primvars: list, path: str, intake: Intake) -> None:
-    """Opacity as it is drawn: 0 is not drawn at all, everything else is opaque, with a note."""
+    """Opacity by the rules of UsdPreviewSurface; of a picture there is none."""
     threshold = value_of(shader, "opacityThreshold", intake)
     threshold = float(threshold) if isinstance(threshold, (int, float)) and np.isfinite(threshold) else 0.0
     if textures.pop("opacity", None) is not None:
@@ -298,10 +298,8 @@ def _read_opacity(shader, values: dict, textures: dict, primvars: list, path: st
         values["opacity"] = 1.0
     elif any(each.parameter.field == "opacity" for each in primvars):
         return
-    elif 0.0 < threshold:
+    elif threshold > 0.0:
         values["opacity"] = float(values["opacity"] >= threshold)
-    elif 0.0 < values["opacity"] < 1.0:
-        intake.note(path, f"inputs:opacity: got {values['opacity']:g}; blending is not simulated, drawn opaque")
 
 
 def _read_normal(shader: UsdShade.Shader, intake: Intake) -> TextureRef | None:

@@ -109,6 +109,7 @@ def _read_document(file: str, intake: Intake) -> Usd.Stage | str:
     fault = confinement_fault(file, intake.limits.root)
     if fault:
         return f"@{file}@: {fault}; displayColor is used"
+    faults = mx.Exception, mx.ExceptionParseError, mx.ExceptionFileMissing, mx.ExceptionFoundCycle
     document = mx.createDocument()
     options = mx.XmlReadOptions()
 
@@ -116,7 +117,8 @@ def _read_document(file: str, intake: Intake) -> Usd.Stage | str:
         included = search_path.find(name).asString()
         outside = confinement_fault(included, intake.limits.root)
         if outside:
-            raise mx.ExceptionFileMissing(f"{included} is {outside}")
+            intake.bad("/", f"@{file}@: includes @{included}@, {outside}; not read")
+            return
         mx.readFromXmlFile(target, name, search_path, inner)
 
     options.readXIncludeFunction = include
@@ -129,7 +131,7 @@ def _read_document(file: str, intake: Intake) -> Usd.Stage | str:
             if not stat.S_ISREG(status.st_mode) or status.st_size > BYTES_MAX:
                 return f"@{file}@: no regular file of at most {BYTES_MAX} bytes; displayColor is used"
             mx.readFromXmlFile(document, file, mx.FileSearchPath(str(Path(file).parent)), options)
-    except (OSError, ValueError, mx.Exception) as problem:
+    except (OSError, ValueError, *faults) as problem:
         return f"@{file}@: cannot be read ({' '.join(str(problem).split())}); displayColor is used"
     return _Translation(file, document).stage
 

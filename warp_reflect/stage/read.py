@@ -22,6 +22,7 @@ from warp_reflect.stage.assemble import Assembly, MeshEntry
 from warp_reflect.stage.baked import read_baked_maps
 from warp_reflect.stage.lights import SHADED_KINDS, default_dome
 from warp_reflect.stage.materialx import is_materialx_error
+from warp_reflect.stage.opacity import drop_transparent
 from warp_reflect.stage.reflectors import Choices, choose_reflectors, parse_patterns
 from warp_reflect.stage.schema import register
 from warp_reflect.stage.walk import State, Walk
@@ -137,6 +138,7 @@ class StageReader:
         data.environment_maps = walk.environment_maps
         Assembly(intake, self.level, choices, self._static).complete(data, walk.drawn, placed)
         choose_reflectors(data, choices)
+        drop_transparent(data, intake)
         data.baked_maps = read_baked_maps(walk.drawn, intake)
         if not data.instances:
             intake.note("/", "the stage holds no geometry that can be drawn")
