@@ -1,4 +1,4 @@
-"""The `warp-reflect` command: `plan`, `render`, `compare`.
+"""The `warp-reflect` command: `plan`, `render`, `bake`, `compare`.
 
 Results go to standard output, notes and errors to standard error. Exit 0: done; 1: a job failed part way;
 2: cannot be done, with one line that says why; 130, 143: stopped by SIGINT, SIGTERM.
@@ -18,7 +18,7 @@ from cyclopts import Parameter
 
 from warp_reflect import images, pipeline
 from warp_reflect.devices import open_device as _open_device
-from warp_reflect.pipeline import DONE, IMPOSSIBLE, SIDE_MAX, Job, one_line, plan_scene
+from warp_reflect.pipeline import DONE, IMPOSSIBLE, PART_WAY, SIDE_MAX, Job, one_line, plan_scene
 from warp_reflect.progress import reporting
 
 INTERRUPTED = 130  # what a shell expects of a process that SIGINT ended
@@ -257,6 +257,69 @@ def _as_tokens(options) -> list[str]:
             for item in value if isinstance(value, list) else [value]:
                 tokens += [flag, str(item)]
     return tokens
+
+
+@Parameter(name="*")
+@dataclass
+class MirrorOptions:
+    """What is a mirror, and how finely it is held."""
+
+    reflector: Annotated[list[str] | None, Parameter(negative=())] = None
+    """Make mirrors of the prims, materials or collection that this path, name or pattern (* and ?) names; repeatable."""
+    set_: Annotated[list[str] | None, Parameter(name="--set", negative=())] = None
+    """A setting, name=value, such as map_resolution=256; repeatable."""
+    complexity: Annotated[str | None, Parameter(name=["--complexity", "-c"])] = None
+    """low, medium, high or veryhigh: how finely surfaces are tessellated."""
+
+
+@app.command
+def bake(
+    stage: str,
+    out: str,
+    /,
+    *,
+    opened: StageOptions | None = None,
+    mirrors: MirrorOptions | None = None,
+) -> int:
+    """Draw the reflector maps of all mirrors once: an EXR each, and a layer over the stage that renders with them.
+
+    Args:
+        stage: A USD file; it is not changed.
+        out: The layer to write, .usd, .usda or .usdc; the maps lie beside it.
+        opened: How the stage is opened.
+        mirrors: What is a mirror; give the same options when the layer is rendered.
+    """
+    from warp_reflect.bake import bake_stage
+
+    opened, mirrors = opened or StageOptions(), mirrors or MirrorOptions()
+    if opened.untrusted:
+        raise ValueError("--untrusted: a stage is baked by opening it here; render it untrusted, without a bake")
+    planned = PlanOptions(reflector=mirrors.reflector, set_=mirrors.set_, complexity=mirrors.complexity)
+    settings = _settings(planned)
+    device = _open_device(opened.device)
+    written = []
+    with reporting(None) as report:
+
+        def wrote(prim_path: str, file, resolution: int) -> None:
+            written.append(str(file))
+            print(f"{file}: {prim_path}, {resolution} nodes along an edge", flush=True)
+
+        try:
+            report.busy("reading " + stage)
+            scene = _load(stage, opened, planned, settings, device, None)
+            report.busy("drawing maps")
+            baked = bake_stage(scene, out, settings, report=wrote)
+        except (*REFUSALS, KeyboardInterrupt) as error:
+            if not written:
+                raise
+            if opened.debug:
+                report.line(traceback.format_exc())
+            report.line(f"error: {one_line(error)}")
+            report.line(f"kept {len(written)} finished: {', '.join(written)}")
+            return PART_WAY
+        report.notes([*scene.notes, *baked.notes])
+    print(f"{baked.layer}: {len(baked.files)} mirror{'s' * (len(baked.files) != 1)} baked, over {stage}")
+    return DONE
 
 
 @app.command
