@@ -1,9 +1,11 @@
 """Render a frame of every USD file below a folder, each in a process of its own: what it cost and how it ended.
 
-Usage: python tools/try_stages.py DIR [DIR ...] [--pictures DIR] [--jobs N]
+Usage: python tools/try_stages.py DIR [DIR ...] [--size 640x360] [--pictures DIR] [--jobs N] [--json FILE]
 
-A file has to end with a picture and notes, or with one line that says why not, within the limits; else the
-table says FAULT and the exit code is 1.
+A file has to end with a picture and notes, or with one line that says why not (exit 2), within 60 seconds and 4 GB;
+else the table says FAULT and the exit code is 1. Where a MANIFEST.md on the way has a table with the columns "stage"
+and "must fail", a file named there must end as it says: an empty cell, "-" or "no" with a picture, all else with
+exit 2.
 """
 
 from __future__ import annotations
@@ -11,21 +13,26 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
+import resource
 import subprocess
 import sys
 import tempfile
 import threading
 import time
+from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
-SIZE = (640, 360)  # pixels
+SIZE = "640x360"  # pixels
 SECONDS = 60.0
-MEMORY_MB = 4096.0
+MEMORY_MB = 4096
 DONE, REFUSED = 0, 2
-MEGABYTE = 1024.0  # of ru_maxrss, which Linux counts in KiB
+KIB_PER_MB = 1024.0  # of ru_maxrss, which Linux counts in KiB
+MANIFEST, STAGE_COLUMN, FAIL_COLUMN = "MANIFEST.md", "stage", "must fail"
+HARMLESS = ("", "-", "no")  # cells of that column that ask for a picture
 
 
 @dataclass
@@ -38,41 +45,69 @@ class Row:
     megabytes: float = 0.0
     mirrors: int = 0
     notes: int = 0
-    refused: bool = False
-    fault: bool = False
+    status: str = "drawn"  # or "refused", "FAULT"
     line: str = ""
 
 
 def main() -> int:
-    """Print the table and a summary; 1 if a file ended in anything but a picture or one line."""
+    """Print the table and a summary; 1 if a file ended in anything but what it should."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, nargs="+")
+    parser.add_argument("--size", default=SIZE, help="of the picture, WIDTHxHEIGHT")
     parser.add_argument("--pictures", type=Path, help="folder to keep a PNG of every stage in")
     parser.add_argument("--jobs", type=int, default=1, help="processes at a time")
     parser.add_argument("--json", type=Path, help="file to write the rows to")
     parser.add_argument("--one", action="store_true", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.one:
-        return render_one(arguments.folder[0], arguments.pictures)
+        return render_one(arguments.folder[0], arguments.size, arguments.pictures)
     if arguments.pictures:
         arguments.pictures.mkdir(parents=True, exist_ok=True)
     files = [(p, p.name) for p in arguments.folder if p.is_file()]
     for folder in arguments.folder:
         files += [(p, str(p.relative_to(folder))) for p in sorted(folder.rglob("*")) if p.suffix in SUFFIXES]
-    print(f"{'triangles':>10} {'s':>6} {'MB':>6} {'mirrors':>7} {'notes':>5}  stage", flush=True)
+    expected = {path.resolve(): fails for folder in arguments.folder for path, fails in expectations(folder).items()}
+    print(f"{'triangles':>10} {'s':>6} {'MB':>6} {'mirrors':>7} {'notes':>5} {'status':7}  stage", flush=True)
+
+    def judged(file: tuple[Path, str]) -> Row:
+        row = try_one(*file, arguments.size, arguments.pictures)
+        must_fail = expected.get(file[0].resolve())
+        if row.status != "FAULT" and must_fail is not None and must_fail != (row.status == "refused"):
+            row.line = f"{MANIFEST} says it must {'fail' if must_fail else 'be drawn'}; {row.line}".rstrip("; ")
+            row.status = "FAULT"
+        return row
+
     with ThreadPoolExecutor(arguments.jobs) as pool:
         rows = []
-        for row in pool.map(lambda file: try_one(*file, arguments.pictures), files):
+        for row in pool.map(judged, files):
             rows.append(row)
             print(
-                f"{row.triangles:10,} {row.seconds:6.1f} {row.megabytes:6.0f} {row.mirrors:7d} {row.notes:5d}  "
-                f"{row.stage}" + (f"  {'FAULT: ' * row.fault}{row.line}" if row.line else ""),
+                f"{row.triangles:10,} {row.seconds:6.1f} {row.megabytes:6.0f} {row.mirrors:7d} {row.notes:5d} "
+                f"{row.status:7}  {row.stage}" + (f": {row.line}" if row.line else ""),
                 flush=True,
             )
     if arguments.json:
         arguments.json.write_text(json.dumps([asdict(row) for row in rows], indent=1))
     print_summary(rows)
-    return 1 if any(row.fault for row in rows) else 0
+    return 1 if any(row.status == "FAULT" for row in rows) else 0
+
+
+def expectations(folder: Path) -> dict[Path, bool]:
+    """Whether each file that a MANIFEST in or below a folder lists must fail; those it does not say are left out."""
+    found = {}
+    for manifest in [*folder.rglob(MANIFEST)] if folder.is_dir() else [folder.parent / MANIFEST]:
+        columns: list[str] = []
+        for line in manifest.read_text().splitlines() if manifest.is_file() else ():
+            if not line.startswith("|"):
+                columns = []
+                continue
+            cells = [cell.strip() for cell in line.strip().strip("|").split("|")]
+            if not columns:
+                columns = [cell.lower() for cell in cells]
+            elif FAIL_COLUMN in columns and not set(line) <= set("|-: ") and len(cells) == len(columns):
+                name = re.sub("[`*]", "", cells[columns.index(STAGE_COLUMN)])
+                found[manifest.parent / name] = cells[columns.index(FAIL_COLUMN)].lower() not in HARMLESS
+    return found
 
 
 def print_summary(rows: list[Row]) -> None:
@@ -80,18 +115,19 @@ def print_summary(rows: list[Row]) -> None:
     if not rows:
         print("no USD file there")
         return
-    faults = sum(row.fault for row in rows)
-    refused = sum(row.refused and not row.fault for row in rows)
-    print(f"{len(rows)} files: {len(rows) - refused - faults} drawn, {refused} refused with one line, {faults} faults")
-    for name in ("seconds", "megabytes", "triangles"):
+    ended = Counter(row.status for row in rows)
+    print(
+        f"{len(rows)} files: {ended['drawn']} drawn, {ended['refused']} refused with one line, {ended['FAULT']} faults"
+    )
+    for name in ("seconds", "megabytes", "triangles", "notes"):
         worst = max(rows, key=lambda row: getattr(row, name))
         print(f"most {name}: {getattr(worst, name):,.0f} ({worst.stage})")
 
 
-def try_one(path: Path, name: str, pictures: Path | None) -> Row:
+def try_one(path: Path, name: str, size: str, pictures: Path | None) -> Row:
     """Render one file in a child process and judge how it ended."""
     row = Row(name)
-    command = [sys.executable, __file__, "--one", str(path)]
+    command = [sys.executable, __file__, "--one", str(path), "--size", size]
     if pictures is not None:
         command += ["--pictures", str(pictures / (name.replace("/", "__") + ".png"))]
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
@@ -102,7 +138,7 @@ def try_one(path: Path, name: str, pictures: Path | None) -> Row:
         _, status, used = os.wait4(child.pid, 0)
         killer.cancel()
         child.returncode = os.waitstatus_to_exitcode(status)
-        row.seconds, row.megabytes = time.perf_counter() - started, used.ru_maxrss / MEGABYTE
+        row.seconds, row.megabytes = time.perf_counter() - started, used.ru_maxrss / KIB_PER_MB
         for stream in (out, err):
             stream.seek(0)
         answer = out.read().decode(errors="replace")
@@ -111,41 +147,47 @@ def try_one(path: Path, name: str, pictures: Path | None) -> Row:
         for key, value in json.loads(answer.splitlines()[-1]).items():
             setattr(row, key, value)
         if told:
-            row.fault, row.line = True, f"exit 0, but on standard error: {told[0]}"
+            row.status, row.line = "FAULT", f"exit 0, but on standard error: {told[0]}"
     elif child.returncode == REFUSED and len(told) == 1:
-        row.refused, row.line = True, told[0]
+        row.status, row.line = "refused", told[0]
     else:
-        row.fault = True
+        row.status = "FAULT"
         row.line = f"over {SECONDS:g} s" if row.seconds >= SECONDS else " | ".join(told[-1:]) or "silence"
         row.line = f"exit {child.returncode}: {row.line}"
     if row.megabytes > MEMORY_MB:
-        row.fault, row.line = True, f"over {MEMORY_MB:g} MB; {row.line}"
+        row.status, row.line = "FAULT", f"over {MEMORY_MB} MB; {row.line}"
     return row
 
 
-def render_one(path: Path, picture: Path | None) -> int:
+def render_one(path: Path, size: str, picture: Path | None) -> int:
     """The child: load, plan, render; the numbers as JSON on standard output, a refusal as one line."""
+    resource.setrlimit(resource.RLIMIT_DATA, (MEMORY_MB << 20, MEMORY_MB << 20))
     import numpy as np
 
     import warp_reflect as wr
-    from warp_reflect import cli
+    from warp_reflect.cli import REFUSALS
+    from warp_reflect.devices import open_device
+    from warp_reflect.pipeline import one_line
 
-    cli._open_device("cpu")
+    open_device("cpu")
     try:
         scene = wr.load_stage(path)
-        plan = wr.make_plan(scene, size=SIZE)
+        plan = wr.make_plan(scene, size=tuple(int(side) for side in size.split("x")), method="auto")
         frame = wr.render_frame(scene, plan)
         if picture is not None:
             frame.write(picture)
-    except cli.REFUSALS as error:
-        print(cli.one_line(error), file=sys.stderr)
+    except REFUSALS as error:
+        print(one_line(error), file=sys.stderr)
         return REFUSED
-    numbers = {"triangles": scene.triangle_count, "mirrors": len(plan.rows), "notes": len(scene.notes + plan.notes)}
+    notes = [*scene.notes, *plan.notes]
+    numbers = {"triangles": scene.triangle_count, "mirrors": len(plan.rows), "notes": len(notes)}
     for name in frame.keys():
-        if np.isnan(frame[name]).any():
-            numbers |= {"fault": True, "line": f"NaN in {name}"}
+        if not np.isfinite(frame[name]).all():
+            numbers |= {"status": "FAULT", "line": f"not finite: {name}"}
+    if len(set(notes)) < len(notes) or any("\n" in note.text for note in notes):
+        numbers |= {"status": "FAULT", "line": "a note is told twice or is more than one line"}
     if scene.triangle_count and not frame["primId"].any():
-        numbers["line"] = "nothing of it is seen"
+        numbers.setdefault("line", "nothing of it is seen")
     print(json.dumps(numbers))
     return DONE
 
