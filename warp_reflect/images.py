@@ -175,9 +175,11 @@ def write_exr(
                 limit = HALF_MAX if is_half else 0.0
                 values = np.nan_to_num(values, nan=0.0, posinf=limit, neginf=-limit)
             pixels[..., k] = np.clip(values, -HALF_MAX, HALF_MAX) if is_half else values
-        spec = oiio.ImageSpec(width, height, len(layer), oiio.FLOAT)
+        kinds = [is_half for _, _, is_half in layer]
+        spec = oiio.ImageSpec(width, height, len(layer), oiio.HALF if all(kinds) else oiio.FLOAT)
         spec.channelnames = [name for name, _, _ in layer]
-        spec.channelformats = tuple(oiio.TypeDesc("half" if is_half else "float") for _, _, is_half in layer)
+        if len(set(kinds)) > 1:  # of a file of several parts the library forgets formats that are all the same
+            spec.channelformats = tuple(oiio.TypeDesc("half" if is_half else "float") for is_half in kinds)
         spec.attribute("compression", "zip")
         spec.attribute("oiio:ColorSpace", "lin_rec709_scene")
         spec.attribute("DateTime", "")  # the same frame is the same file

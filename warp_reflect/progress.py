@@ -131,7 +131,9 @@ def reporting(style: str | None) -> Iterator[Report]:
 
     columns = [SpinnerColumn(), TextColumn("{task.description}", markup=False), BarColumn()]
     columns += [MofNCompleteColumn(), TimeRemainingColumn()]
-    with Progress(*columns, console=Console(stderr=True), transient=True, redirect_stdout=True) as bar:
+    # What the bar redirects it prints on its own console: results that go to a file must not end there.
+    console, redirect = Console(stderr=True), sys.stdout.isatty()
+    with Progress(*columns, console=console, transient=True, redirect_stdout=redirect) as bar:
         yield Report(style, bar)
 
 
