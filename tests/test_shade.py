@@ -537,3 +537,34 @@ def test_shadows_are_seen_in_mirrors():
     np.testing.assert_allclose(mirror[0][index[on_ground]], 1.0, atol=1e-4)
     assert not mirror[1][index[under]].any()
     np.testing.assert_allclose(mirror[1][index[free]], 1.0, atol=1e-4)
+
+
+@pytest.mark.parametrize("roughness", [0.0, 0.175, 1.0])
+def test_clear_coat_is_divided_by_its_own_roughness(roughness):
+    """A black body with a full coat, a distant light only: what is not mirrored sharply is scattered like Lambert's."""
+    material = MaterialData(
+        base_color=(0, 0, 0),
+        roughness=1.0,
+        ior=1.5,
+        clearcoat=1.0,
+        clearcoat_roughness=roughness,
+        specular_workflow=True,
+    )
+    to_light = np.array([0.0, 0.0, 1.0])
+    scene = scene_of([(ball_mesh(), place(), material)], [distant((np.pi,) * 3, to_light)])
+    camera = look_at((0, 0, 4), (0, 0, 0))
+    rgba, _, triangle, normal = picture_of(scene, camera)
+    seen = triangle >= 0
+    toward = np.abs(np.einsum("ij,ij->i", eye_rays(camera), normal))[seen]
+    coat = fresnel(0.04, 1.0, toward)
+    sharp = np.clip((0.3 - roughness) / 0.25, 0.0, 1.0)
+    wanted = (1.0 - sharp) * coat * np.maximum(normal[seen] @ to_light, 0.0)[:, None]
+    # The body itself: F90 of its rough lobe is white at grazing angles only, and nothing of it is sharp.
+    np.testing.assert_allclose(rgba[seen, :3], np.repeat(wanted, 3, axis=1), atol=2e-5)
+
+
+def test_a_rough_coat_keeps_the_furnace():
+    material = MaterialData(base_color=(1, 1, 1), roughness=0.2, clearcoat=0.8, clearcoat_roughness=0.2)
+    scene = scene_of([(ball_mesh(), place(), material)], [dome((0.7, 0.8, 0.9))])
+    rgba = picture_of(scene, look_at((0, 1, 3), (0, 0, 0)))[0]
+    np.testing.assert_allclose(rgba[:, :3], np.tile(np.float32([0.7, 0.8, 0.9]), (len(rgba), 1)), rtol=2e-6)

@@ -294,3 +294,128 @@ def test_mirrored_instances_keep_their_coordinates(device, noise):
     flipped, _ = picture_of(scene_of([(quad(2.0), np.diag([-1.0, 1.0, 1.0, 1.0]), material)], device), camera)
     shape = (SIZE[1], SIZE[0], 4)
     np.testing.assert_allclose(flipped.reshape(shape)[:, ::-1], plain.reshape(shape), atol=1e-5)
+
+
+def write_tiles(folder, numbers, seed=7) -> dict[int, np.ndarray]:
+    """Random linear pictures of 4 x 4 texels by UDIM number, written as set.NUMBER.exr."""
+    rng = np.random.default_rng(seed)
+    tiles = {number: rng.uniform(0, 1, (4, 4, 3)).astype(np.float32) for number in numbers}
+    for number, picture in tiles.items():
+        write_exr(folder / f"set.{number}.exr", {"RGB": picture}, half=())
+    return tiles
+
+
+def tiled_quads(first, second) -> MeshData:
+    """Two quads side by side; their coordinates fill the tiles at the given (column, row)."""
+    points, uvs = [], []
+    for k, (column, row) in enumerate((first, second)):
+        points += [[2 * k - 2, -1, 0], [2 * k, -1, 0], [2 * k, 1, 0], [2 * k - 2, 1, 0]]
+        uvs += [[column, row], [column + 1, row], [column + 1, row + 1], [column, row + 1]]
+    return MeshData(
+        points=np.float32(points), triangles=np.int32([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]]), uvs=np.float32(uvs)
+    )
+
+
+@pytest.mark.parametrize("places", [((0, 0), (1, 0)), ((9, 0), (0, 1)), ((3, 12), (4, 2))])
+def test_tiles_are_looked_up_where_their_triangles_lie(device, tmp_path, places):
+    numbers = [1001 + column + 10 * row for column, row in places]
+    tiles = write_tiles(tmp_path, numbers)
+    texture = TextureRef(str(tmp_path / "set.<UDIM>.exr"), wrap=("repeat", "repeat"))
+    material = dataclasses.replace(MATT, textures={"base_color": texture})
+    camera = looking_down(5.0)
+    scene = scene_of([(tiled_quads(*places), np.eye(4), material)], device)
+    rgba, triangle = picture_of(scene, camera)
+    p = plane_points(camera)
+    for k, number in enumerate(numbers):
+        mine = (triangle >= 2 * k) & (triangle < 2 * k + 2)
+        u, v = p[mine, 0] / 2 + 1 - k, p[mine, 1] / 2 + 0.5
+        assert mine.sum() > 150
+        wanted = looked_up(tiles[number].astype(float), u, v, ("clamp", "clamp"))
+        np.testing.assert_allclose(rgba[mine, :3], wanted, atol=1e-4)
+    assert not scene.notes
+
+
+def test_missing_tile_shows_the_fallback_and_is_told_once(device, tmp_path):
+    write_tiles(tmp_path, [1001])
+    texture = TextureRef(str(tmp_path / "set.<UDIM>.exr"))
+    material = MaterialData(
+        "/m", base_color=(0.1, 0.2, 0.3), roughness=1.0, ior=1.0, textures={"base_color": texture, "emissive": texture}
+    )
+    scene = scene_of([(tiled_quads((0, 0), (1, 0)), np.eye(4), material)], device)
+    rgba, triangle = picture_of(scene, looking_down(5.0))
+    np.testing.assert_allclose(rgba[triangle >= 2, :3], np.tile([0.1, 0.2, 0.3], ((triangle >= 2).sum(), 1)), atol=1e-5)
+    found = [note.text for note in scene.notes if "no tile" in note.text]
+    assert len(found) == 2 and all("no tile 1002; its constant" in text for text in found)
+
+
+def test_only_tiles_in_use_are_read(device, tmp_path):
+    write_tiles(tmp_path, [1001, 1002])
+    (tmp_path / "set.1003.exr").write_bytes(b"no picture")
+    material = dataclasses.replace(MATT, textures={"base_color": TextureRef(str(tmp_path / "set.<UDIM>.exr"))})
+    scene = scene_of([(tiled_quads((0, 0), (1, 0)), np.eye(4), material)], device)
+    picture_of(scene, looking_down(5.0))
+    assert not scene.notes
+
+
+def test_tiles_that_came_with_the_data_need_no_file(device, tmp_path):
+    write_tiles(tmp_path, [1001, 1002])
+    material = dataclasses.replace(MATT, textures={"base_color": TextureRef(str(tmp_path / "set.<UDIM>.exr"))})
+    mesh = tiled_quads((0, 0), (1, 0))
+    lights = [LightData("/dome", "dome", (1.0, 1.0, 1.0), np.eye(4))]
+    data = SceneData("test", [mesh], [InstanceData(0, np.eye(4), "/p", (0,))], [material], lights, [])
+    camera = looking_down(5.0)
+    expected, _ = picture_of(Scene(data, device), camera)
+    packed = textures.with_pictures(data)
+    for file in tmp_path.glob("set.*.exr"):
+        file.unlink()
+    np.testing.assert_array_equal(picture_of(Scene(packed, device), camera)[0], expected)
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_samples_that_are_no_light_are_counted_in_a_note(device, tmp_path, packed):
+    import OpenImageIO as oiio  # the package's own writer repairs what it writes
+
+    pixels = np.full((4, 4, 3), 0.5, np.float32)
+    pixels[0, 0], pixels[1, 1, 0], pixels[2, 2, 1] = np.nan, np.inf, -3.0
+    file = str(tmp_path / "bad.exr")
+    out = oiio.ImageOutput.create("openexr")
+    assert out.open(file, oiio.ImageSpec(4, 4, 3, oiio.FLOAT)) and out.write_image(pixels) and out.close()
+    del out
+    material = dataclasses.replace(MATT, textures={"base_color": TextureRef(file)})
+    scene = scene_of([(quad(), np.eye(4), material)], device)
+    if packed:
+        scene = Scene(textures.with_pictures(scene.data), device)
+        scene.notes += scene.data.notes
+    for _ in range(2):
+        rgba, _ = picture_of(scene, looking_down(3.0))
+        assert np.isfinite(rgba).all()
+    found = {note.text for note in scene.notes}
+    assert len(found) == 1 and "base_color" in min(found) and "5 samples that are no light" in min(found)
+    # Another scene that shares the picture in memory is told as well.
+    again = scene_of([(quad(), np.eye(4), material)], device)
+    picture_of(again, looking_down(3.0))
+    assert len(again.notes) == 1
+
+
+@pytest.mark.parametrize("channel", ["rrr", "bgr", "gab"])
+def test_channels_may_be_mixed(device, tmp_path, channel):
+    rng = np.random.default_rng(9)
+    pixels = rng.uniform(0, 1, (4, 4, 4)).astype(np.float32)
+    write_exr(tmp_path / "n.exr", {"RGBA": pixels}, half=())
+    scale, bias = (0.5, 0.25, 1.0, 1.0), (0.0, 0.125, 0.0, 0.0)
+    texture = TextureRef(str(tmp_path / "n.exr"), channel, wrap=("clamp", "clamp"), scale=scale, bias=bias)
+    camera = looking_down(2.0)
+    material = dataclasses.replace(MATT, textures={"base_color": texture})
+    rgba, _ = picture_of(scene_of([(quad(2.0), np.eye(4), material)], device), camera)
+    picked = pixels[..., ["rgba".index(letter) for letter in channel]].astype(float)
+    u, v = (plane_points(camera) / 4.0 + 0.5).T
+    wanted = looked_up(picked, u, v, ("clamp", "clamp")) * scale[:3] + bias[:3]
+    np.testing.assert_allclose(rgba[:, :3], wanted, atol=3e-5)
+
+
+def test_means_of_tiles_decide_what_is_a_mirror(device, tmp_path):
+    tiles = write_tiles(tmp_path, [1001, 1002])
+    looked = {"metallic": TextureRef(str(tmp_path / "set.<UDIM>.exr"), "g", "raw")}
+    scene = scene_of([(tiled_quads((0, 0), (1, 0)), np.eye(4), MaterialData("/m", textures=looked))], device)
+    wanted = np.mean([picture[..., 1].mean() for picture in tiles.values()])
+    assert scene.data.materials[0].metallic == pytest.approx(wanted, abs=1e-6)

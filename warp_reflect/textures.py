@@ -500,7 +500,7 @@ def _tell_missing_tiles(data, material: int, name: str, whole: TextureRef, found
     absent = [n for n in used_tiles(data, material, whole) if _tile(whole, n).file not in files]
     if absent:
         listed = ", ".join(str(TILE_FIRST + number) for number in absent)
-        note(data.materials[material].path, name, f"{whole.file}: no tile {listed}; its fallback is used there")
+        note(data.materials[material].path, name, f"{whole.file}: no tile {listed}; its constant is used there")
 
 
 def _directionless(texture: TextureRef, pixels: np.ndarray) -> int:
