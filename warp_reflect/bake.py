@@ -74,7 +74,7 @@ def bake_stage(
         if fault:
             notes.append(Note(prim_path, f"no map is baked: {fault}; it is drawn when it is needed"))
             continue
-        maps = tuple(baking.to_baked(each) for each in reflector_map.drawn_maps(plan.prepared(row)))
+        maps = tuple(baking.to_baked(scene, part, each) for each in reflector_map.drawn_maps(plan.prepared(row)))
         if not maps:
             notes.append(Note(prim_path, "no map is baked: all of its pieces are held without one"))
             continue

@@ -34,6 +34,8 @@ class BakedMap:
         unit_from_body: float64 [4, 4].
         extent: float64 [3].
         inner_radius, outer_radius: As in `ReflectorMap`.
+        world_from_object: Where the mirror was when its map was drawn, float64 [4, 4].
+        origin: The scene frame's origin then, which `unit_from_body` refers to, float64 [3].
     """
 
     geometry: str
@@ -42,6 +44,8 @@ class BakedMap:
     extent: np.ndarray
     inner_radius: float
     outer_radius: float
+    world_from_object: np.ndarray
+    origin: np.ndarray
 
     @property
     def resolution(self) -> int:
@@ -65,6 +69,11 @@ class BakedMap:
             return f"extent: got {self.extent.tolist()}, expected 3 numbers above 0"
         if not (np.isfinite([self.inner_radius, self.outer_radius]).all() and self.outer_radius > 0.0):
             return f"radii: got {self.inner_radius:g} and {self.outer_radius:g}, expected finite numbers"
+        place = self.world_from_object
+        if place.shape != (4, 4) or self.origin.shape != (3,):
+            return f"place: got shapes {list(place.shape)} and {list(self.origin.shape)}, expected [4, 4] and [3]"
+        if not (np.isfinite(place).all() and np.isfinite(self.origin).all()):
+            return "place: expected finite numbers"
         return ""
 
 
@@ -94,6 +103,8 @@ def write_maps(
             "extent": each.extent.tolist(),
             "inner_radius": float(each.inner_radius),
             "outer_radius": float(each.outer_radius),
+            "world_from_object": each.world_from_object.tolist(),
+            "origin": each.origin.tolist(),
         }
         for each in maps
     ]
@@ -134,6 +145,8 @@ def read_maps(path: str | os.PathLike) -> tuple[BakedMap, ...]:
                 np.array(entry["extent"], np.float64),
                 float(entry["inner_radius"]),
                 float(entry["outer_radius"]),
+                np.array(entry["world_from_object"], np.float64),
+                np.array(entry["origin"], np.float64),
             )
             for k, entry in enumerate(entries)
         )

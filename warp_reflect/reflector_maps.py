@@ -187,9 +187,9 @@ class ReflectorMap:
         )
 
     @classmethod
-    def restored(cls, baked: BakedMap, device="cpu"):
-        """A map that was drawn before, bit for bit."""
-        numbers = baked.texels, baked.unit_from_body, baked.extent, baked.inner_radius, baked.outer_radius
+    def restored(cls, baked: BakedMap, unit_from_body: np.ndarray, device="cpu"):
+        """A map that was drawn before, bit for bit, of a body that may have moved."""
+        numbers = baked.texels, unit_from_body, baked.extent, baked.inner_radius, baked.outer_radius
         return cls._of(*numbers, device).of_geometry(baked.geometry)
 
     def of_geometry(self, digest: str) -> ReflectorMap:

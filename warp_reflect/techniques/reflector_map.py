@@ -10,6 +10,7 @@ Objects" (2005), section 4.1 (maps); the search itself is `map_search.py`. What 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import warp as wp
@@ -146,15 +147,17 @@ def prepare(scene: Scene, reflector: Reflector, settings: Settings) -> Prepared:
     points, faces, normals = part_mesh(scene, part)
     polish = _Polish(scene, part) if any(scene.patch_shapes[k] is not None for k in part.patches) else None
     resolution, body = settings.map_resolution, scene.body(reflector.part)
-    drawn = baking.baked_or_drawn(
-        scene,
-        part,
-        (points, faces, normals),
+    draw = partial(
+        ReflectorMap.from_mesh,
+        points,
+        faces,
         resolution,
-        lambda: ReflectorMap.from_mesh(
-            points, faces, resolution, normals=normals, polish=polish, body=body, device=scene.device
-        ),
+        normals=normals,
+        polish=polish,
+        body=body,
+        device=scene.device,
     )
+    drawn = baking.baked_or_drawn(scene, part, faces, resolution, draw)
     cells = grid.build(scene, part, settings.grid_share) if settings.grid_share > 0.0 else None
     return Prepared(reflector, drawn, drawn.unit_from_body, cells)
 
