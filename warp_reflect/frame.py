@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections import Counter
 from functools import cached_property
 
 import numpy as np
 
 from warp_reflect import __version__, images, raster, shade, surface
 from warp_reflect.channels import CHANNELS, POINTS, component_of, known_names, reflection_channels
-from warp_reflect.layers import Camera, GBuffer, ReflectionLayer
+from warp_reflect.layers import Camera, GBuffer, ReflectionLayer, add_statistics
 from warp_reflect.planner import Plan, find_camera
 from warp_reflect.scene import Scene
 from warp_reflect.techniques import TECHNIQUES
@@ -25,7 +24,8 @@ class Frame:
         scene, plan, camera: What it was made from.
         gbuffer: What the eye sees.
         layers: Reflector id to its `ReflectionLayer`.
-        statistics: Counts over all reflectors: pixels settled by `candidate`, `walk`, `empty`, `bvh`; vertices; ...
+        statistics: Counts over all reflectors: pixels settled by `candidate`, `walk`, `empty`, `bvh`; vertices; ...; the
+            largest bounds: `reused_px`.
         timings: Milliseconds per stage.
     """
 
@@ -42,7 +42,9 @@ class Frame:
         self.camera: Camera = gbuffer.camera
         self.timings = timings
         self._picture = picture
-        self.statistics = dict(sum((Counter(layer.statistics) for layer in layers.values()), Counter()))
+        self.statistics: dict = {}
+        for layer in layers.values():
+            add_statistics(self.statistics, layer.statistics)
 
     @property
     def prims(self) -> dict[int, str]:

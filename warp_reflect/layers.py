@@ -290,3 +290,9 @@ class ReflectionLayer:
             distance=wp.zeros(n, dtype=float, device=device),
             status=wp.full(n, int(Status.NONE), dtype=wp.uint8, device=device),
         )
+
+
+def add_statistics(total: dict, statistics: dict) -> None:
+    """Add a layer's statistics to a total: counts add up, bounds (names that end in `_px`) are the largest."""
+    for name, value in statistics.items():
+        total[name] = max(total.get(name, 0.0), value) if name.endswith("_px") else total.get(name, 0) + value

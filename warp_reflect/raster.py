@@ -53,6 +53,7 @@ class TargetView:
     near: float
     far: float
     orthographic: int
+    painter: int  # 1: a triangle has one depth, that of its middle
     # Exact depth of virtual triangles (see `attach_rays`); length 0: the depth key is interpolated.
     ray_origin: wp.array(dtype=wp.vec4)
     ray_direction: wp.array(dtype=wp.vec4)
@@ -360,6 +361,12 @@ def cull_kernel(
     out_survivors[part * step + place] = i
 
 
+@wp.func
+def at_depth(v: wp.vec4, key: float) -> wp.vec4:
+    """A corner at another depth key; one in front of the near plane stays as it is, for the clipper."""
+    return wp.vec4(v[0], v[1], wp.where(v[2] > 0.0, key, v[2]), v[3])
+
+
 @wp.kernel
 def draw_kernel(
     first: int,
@@ -396,6 +403,11 @@ def draw_kernel(
         # Unit length: RAY_ALONG_MIN is a sine.
         plane.n = unit(wp.cross(points[own[1]] - p, points[own[2]] - p))
         plane.offset = wp.dot(plane.n, p)
+    if target.painter != 0:
+        middle = (a[2] + b[2] + c[2]) / 3.0
+        a = at_depth(a, middle)
+        b = at_depth(b, middle)
+        c = at_depth(c, middle)
     if needs_clipping(a) or needs_clipping(b) or needs_clipping(c):
         draw_clipped(target, a, b, c, plane, triangle, row_first, row_end)
     else:

@@ -388,6 +388,18 @@ class Scene:
         return wp.array(closed, dtype=int, device=self.device)
 
     @cached_property
+    def boxes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Per instance (first vertex, vertex count, corners of its box, float64 [n, 8, 3], scene frame)."""
+        spans = sorted({(part.first_vertex, part.vertex_count) for part in self.parts if part.vertex_count})
+        if not spans:
+            return np.zeros(0, int), np.zeros(0, int), np.zeros((0, 8, 3))
+        first, count = np.array(spans).T
+        low = np.minimum.reduceat(self.host_points, first, axis=0).astype(np.float64)
+        high = np.maximum.reduceat(self.host_points, first, axis=0).astype(np.float64)
+        bits = (np.arange(8)[:, None] >> np.arange(3)) & 1
+        return first, count, np.where(bits[None] == 1, high[:, None], low[:, None])
+
+    @cached_property
     def tracer(self):
         """The owner of the scene's ray acceleration structure (`bvh.Tracer`), built at first use."""
         from warp_reflect import bvh

@@ -59,6 +59,7 @@ class Technique(IntEnum):
 SEARCHES = ("newton", "midpoint")
 GRID_KINDS = ("direction", "position")
 REFINEMENTS = ("exact", "off")
+OCCLUSIONS = ("exact", "painter")
 
 
 @dataclass(frozen=True)
@@ -77,6 +78,10 @@ class Settings:
     """Interpolation grid: solved nodes as a fraction of the vertices; 0: every vertex is searched."""
     grid_kind: str = "direction"
     """What the grid holds: `direction` (one exact step a vertex) or `position` (the paper's virtual positions)."""
+    reuse_px: float = 0.0
+    """A virtual vertex of the previous frame is kept while the bound on its drift stays below this; 0: off. [pixels]"""
+    occlusion: str = "exact"
+    """What hides what in a virtual picture: `exact` (path length per pixel) or `painter` (one depth a triangle; no refine)."""
     edge_px: float = 0.25
     """Virtual triangles are cut until a straight edge's picture bends by less than this; 0: never cut. [pixels]"""
     refine: str = "exact"
@@ -98,6 +103,10 @@ class Settings:
         _require(self.search in SEARCHES, "search", self.search, f"one of {', '.join(SEARCHES)}")
         _require(0.0 <= self.grid_share <= 1.0, "grid_share", self.grid_share, "0 to 1")
         _require(self.grid_kind in GRID_KINDS, "grid_kind", self.grid_kind, f"one of {', '.join(GRID_KINDS)}")
+        _require(0.0 <= self.reuse_px <= 1.0e6, "reuse_px", self.reuse_px, "0 (off) or a number of pixels")
+        _require(self.occlusion in OCCLUSIONS, "occlusion", self.occlusion, f"one of {', '.join(OCCLUSIONS)}")
+        painted = self.occlusion == "painter" and self.refine != "off"
+        _require(not painted, "occlusion", self.occlusion, "exact, or refine=off with it")
         _require(0.0 <= self.edge_px <= 1.0e6, "edge_px", self.edge_px, "0 (never cut) or a number of pixels")
         _require(self.refine in REFINEMENTS, "refine", self.refine, f"one of {', '.join(REFINEMENTS)}")
         _require(self.complexity in COMPLEXITIES, "complexity", self.complexity, f"one of {', '.join(COMPLEXITIES)}")

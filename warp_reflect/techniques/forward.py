@@ -24,11 +24,17 @@ from warp_reflect.layers import (
     Reflector,
     project,
 )
-from warp_reflect.optics import virtual_point
 from warp_reflect.scene import PartRange, Scene, SceneView
 from warp_reflect.settings import Settings, Status
 from warp_reflect.shapes import clamp_weights, intersect_triangle
-from warp_reflect.techniques import refine, virtual_mesh
+from warp_reflect.techniques import cull, refine, reuse, virtual_mesh
+from warp_reflect.techniques.vertices import (
+    VertexView,
+    copy_vertices,
+    empty_vertices,
+    solve_frame,
+    vertices_from,
+)
 from warp_reflect.techniques.virtual_mesh import VirtualMesh
 from warp_reflect.timing import StageTimer
 
@@ -38,63 +44,18 @@ CONVERGED = wp.constant(int(Status.CONVERGED))
 HIDDEN = wp.constant(int(Status.HIDDEN))
 MAX_ITERATIONS = wp.constant(int(Status.MAX_ITERATIONS))
 SKY = wp.constant(int(Status.SKY))
-ESTIMATE = wp.constant(8.0 / 1.5)
 # Bisections of an edge at the hidden boundary: 1/4096 of its length, below a pixel, or, where refinement finds the exact
 # hit anyway, a candidate close enough to walk from.
 BOUNDARY_STEPS = {"off": 12, "exact": 5}
 
 
-@wp.struct
-class SolveFrame:
-    """The unit frame of a reflector (a similarity of the scene frame) and the eye in it."""
-
-    unit_from_scene: wp.mat33
-    unit_offset: wp.vec3
-    eye_from_unit: wp.mat33  # of differences: eye-frame point = eye_from_unit (q - eye)
-    eye: wp.vec3
-
-
-@wp.struct
-class VertexView:
-    """Per scene vertex: where its virtual vertex appears (`layers.project`; key -1: nowhere), and how it was found."""
-
-    screen: wp.array(dtype=wp.vec4)
-    status: wp.array(dtype=wp.uint8)
-    seed: wp.array(dtype=wp.vec3)  # what a warm start begins from; zero: nothing known
-    residual: wp.array(dtype=float)
-    reach: wp.array(dtype=float)  # edge length whose picture bends by one radian (unit frame); 0: it never bends
-    position: wp.array(dtype=wp.vec3)  # eye-frame virtual vertex; length 0 where nobody reads it
-
-
 @dataclass
 class History:
-    """What the next frame of a reflector may start from: the mesh it reflected, and the seeds of its vertices."""
+    """What the next frame of a reflector may start from: the mesh it reflected, its vertices, and the eye's place."""
 
     mesh: VirtualMesh
-    seed: wp.array
-
-
-@wp.func
-def virtual_vertex(frame: SolveFrame, p: wp.vec3, n: wp.vec3, target: wp.vec3) -> wp.vec3:
-    """Virtual vertex of a reflection point (unit frame), in the eye frame."""
-    # Curvature of a body of the map's size: it only picks the form that forgives an error of p more.
-    curvature = 1.0 / wp.max(wp.length(p), 1.0e-6)
-    return frame.eye_from_unit * (virtual_point(p, n, frame.eye, target, curvature) - frame.eye)
-
-
-@wp.func
-def edge_reach(frame: SolveFrame, p: wp.vec3, n: wp.vec3, target: wp.vec3, curvature: float) -> float:
-    """Length of a scene edge at `target` whose virtual picture deviates from a straight one by one radian.
-
-    The deviation grows with the square of the length: (h^2 / 8) 1.5 / (d_O d_V^2 lambda), lambda the least eigenvalue of
-    the path length's Hessian with the body's least curvature. Estimate of the interpolation error of virtual positions.
-    """
-    to_eye = frame.eye - p
-    d_o = wp.length(to_eye)
-    d_v = wp.length(target - p)
-    c = wp.abs(wp.dot(n, to_eye)) / wp.max(d_o, 1.0e-20)
-    least = c * c * (1.0 / wp.max(d_o, 1.0e-20) + 1.0 / wp.max(d_v, 1.0e-20)) + 2.0 * c * curvature
-    return d_v * wp.sqrt(ESTIMATE * d_o * least)
+    vertices: VertexView
+    eye: np.ndarray
 
 
 @wp.kernel
@@ -219,18 +180,6 @@ def own_vertices(part: PartRange) -> list[int]:
     return [part.first_vertex, part.vertex_count if part.is_whole else 0]
 
 
-def solve_frame(scene: Scene, camera: Camera, unit_from_scene: np.ndarray) -> SolveFrame:
-    """The frame of a reflector seen by a camera, composed in float64."""
-    linear = unit_from_scene[:3, :3]
-    eye = linear @ (camera.eye - scene.origin) + unit_from_scene[:3, 3]
-    frame = SolveFrame()
-    frame.unit_from_scene = wp.mat33(linear.astype(np.float32))
-    frame.unit_offset = wp.vec3(*unit_from_scene[:3, 3])
-    frame.eye_from_unit = wp.mat33(np.linalg.inv(linear).astype(np.float32))
-    frame.eye = wp.vec3(*eye)
-    return frame
-
-
 def reflect(
     scene: Scene,
     reflector: Reflector,
@@ -243,6 +192,7 @@ def reflect(
     camera: Camera,
     settings: Settings,
     history: History | None,
+    greatest_curvature: float | None = None,
 ) -> ReflectionLayer:
     """Reflect a scene in one mirror by virtual objects.
 
@@ -252,6 +202,7 @@ def reflect(
             `own_count` are the mirror's own or the scene's, see `own_vertices`.
         solve_boundary: (points, frame, edges vec2i, out points vec3) -> None, see `reflector_map.boundary_kernel`.
         history: The same reflector's layer history of the previous frame.
+        greatest_curvature: Of the mirror, unit frame; None: its vertices are solved anew every frame.
 
     Returns:
         The layer; with `refine="exact"` every pixel is the hit of an exact ray-triangle test.
@@ -262,19 +213,39 @@ def reflect(
     timer = StageTimer(scene.device)
     part = scene.parts[reflector.part]
     frame = solve_frame(scene, camera, unit_from_scene)
+    unit_per_scene = float(np.cbrt(abs(np.linalg.det(unit_from_scene[:3, :3]))))
+
+    def solve_apart(points: wp.array) -> VertexView:
+        """Points that are no vertices of the scene's."""
+        answers = empty_vertices(len(points), scene.device)
+        solve_vertices(points, False, frame, False, answers)
+        return answers
+
     with timer("search"):
         mesh = history.mesh if history else virtual_mesh.whole(scene, part)
-        vertices = empty_vertices(mesh.vertex_count, scene.device)
+        keeping = settings.reuse_px > 0.0 and greatest_curvature is not None
+        vertices = empty_vertices(mesh.vertex_count, scene.device, with_position=keeping)
         if history:
-            wp.copy(vertices.seed, history.seed)  # the previous frame keeps its own answer
+            wp.copy(vertices.seed, history.vertices.seed)  # the previous frame keeps its own answer
+        if history and keeping:
+            curvature = greatest_curvature * unit_per_scene
+            reused, reused_px = reuse.keep(
+                scene, mesh.points, camera, gbuffer.view, history, curvature, settings, vertices
+            )
+            layer.statistics.update(reused=reused, reused_px=reused_px)
+        if reflector.convex:
+            layer.statistics["culled"] = cull.settle_culled(
+                scene, solve_apart, pixels, camera, unit_per_scene, vertices
+            )
         solve_vertices(mesh.points, True, frame, history is not None, vertices)
     with timer("tessellate"):
         mesh, vertices = _cut_where_bent(
-            scene, part, mesh, vertices, frame, solve_vertices, unit_from_scene, camera, pixels, settings
+            scene, part, mesh, vertices, frame, solve_vertices, solve_apart, unit_per_scene, camera, pixels, settings
         )
-        layer.history = History(mesh, vertices.seed)
+        layer.history = History(mesh, vertices, camera.eye)
     with timer("virtual_raster"):
         target = raster.make_target(gbuffer.view, pixels.box, scene.device, gbuffer.reflector_id, reflector.id)
+        target.view.painter = int(settings.occlusion == "painter")
         if settings.refine == "exact":
             raster.attach_rays(target, gbuffer.view, pixels, settings.threads)
         drawn = raster.rasterise(target, vertices.screen, mesh.triangles, points=mesh.points, threads=settings.threads)
@@ -310,28 +281,12 @@ def reflect(
     return layer
 
 
-def empty_vertices(count: int, device, with_position: bool = False) -> VertexView:
-    """Per-vertex results before a solver ran: nothing has a picture."""
-    vertices = VertexView()
-    vertices.screen = wp.full(count, wp.vec4(0.0, 0.0, raster.DROPPED, 0.0), dtype=wp.vec4, device=device)
-    vertices.status = wp.zeros(count, dtype=wp.uint8, device=device)
-    vertices.residual = wp.zeros(count, dtype=float, device=device)
-    vertices.reach = wp.zeros(count, dtype=float, device=device)
-    vertices.seed = wp.zeros(count, dtype=wp.vec3, device=device)
-    vertices.position = wp.zeros(count if with_position else 0, dtype=wp.vec3, device=device)
-    return vertices
-
-
-VERTEX_ARRAYS = ("screen", "status", "residual", "reach", "seed")
-
-
 def _cut_where_bent(
-    scene, part, mesh, vertices, frame, solve_vertices, unit_from_scene, camera, pixels, settings
+    scene, part, mesh, vertices, frame, solve_vertices, solve_apart, unit_per_scene, camera, pixels, settings
 ) -> tuple[VirtualMesh, VertexView]:
     """Cut triangles whose picture would bend by more than `edge_px`; keep the mesh where it is fine enough."""
     if settings.edge_px == 0.0:
         return mesh, vertices
-    unit_per_scene = float(np.cbrt(abs(np.linalg.det(unit_from_scene[:3, :3]))))
     tolerance = settings.edge_px / max(camera.fx, camera.fy)
 
     def cuts_for(multiple: float) -> np.ndarray:
@@ -341,13 +296,12 @@ def _cut_where_bent(
         cuts[part.first_triangle : part.first_triangle + part.triangle_count] = 1
         return cuts
 
-    if (cuts_for(mesh.relaxed) <= mesh.estimated).all():
+    late = np.count_nonzero(cuts_for(mesh.relaxed) > mesh.estimated)
+    if late <= virtual_mesh.LATE_SHARE * np.count_nonzero(mesh.estimated > 1):
         return mesh, vertices
     estimated = cuts_for(1.0 / virtual_mesh.CUT_SLACK)
     ids = np.flatnonzero(estimated > 1)
-    middle_points = wp.array(virtual_mesh.edge_middles(scene, ids), dtype=wp.vec3, device=scene.device)
-    middles = empty_vertices(len(middle_points), scene.device)
-    solve_vertices(middle_points, False, frame, False, middles)
+    middles = solve_apart(wp.array(virtual_mesh.edge_middles(scene, ids), dtype=wp.vec3, device=scene.device))
     cuts, relaxed = np.ones(scene.triangle_count, np.uint8), 1.0
     for _ in range(virtual_mesh.RELAX_STEPS):
         allowed_px = settings.edge_px * relaxed / virtual_mesh.CUT_SLACK
@@ -357,14 +311,10 @@ def _cut_where_bent(
             break
         relaxed *= virtual_mesh.RELAX
     finer = virtual_mesh.cut_mesh(scene, part, cuts, estimated, relaxed)
-    known = empty_vertices(finer.vertex_count, scene.device)
     base = mesh.base_count
-    added = VertexView()
-    for name in VERTEX_ARRAYS:
-        wp.copy(getattr(known, name), getattr(vertices, name), count=base)
-        setattr(added, name, getattr(known, name)[base:])
-    added.position = wp.zeros(0, dtype=wp.vec3, device=scene.device)
-    solve_vertices(finer.points[base:], False, frame, False, added)
+    known = empty_vertices(finer.vertex_count, scene.device, with_position=len(vertices.position) > 0)
+    copy_vertices(known, vertices, base)
+    solve_vertices(finer.points[base:], False, frame, False, vertices_from(known, base))
     return finer, known
 
 

@@ -19,7 +19,6 @@ from warp_reflect.layers import Camera, CameraView, project
 from warp_reflect.reflector_maps import ReflectorMap, ReflectorMapView, sample_map
 from warp_reflect.scene import PartRange, Scene
 from warp_reflect.settings import Settings, Status
-from warp_reflect.techniques.forward import SolveFrame, VertexView, edge_reach, virtual_vertex
 from warp_reflect.techniques.map_search import (
     ACCEPTED,
     SearchSettings,
@@ -28,6 +27,7 @@ from warp_reflect.techniques.map_search import (
     solve_vertex,
     step_on_cube,
 )
+from warp_reflect.techniques.vertices import SolveFrame, VertexView, edge_reach, virtual_vertex
 
 wp.set_module_options({"enable_backward": False})
 

@@ -18,7 +18,7 @@ from warp_reflect.layers import CameraView, project
 from warp_reflect.reflector_maps import MapSample, ReflectorMapView, sample_map
 from warp_reflect.settings import Settings, Status
 from warp_reflect.shapes import max_abs
-from warp_reflect.techniques.forward import SolveFrame, VertexView, edge_reach, virtual_vertex
+from warp_reflect.techniques.vertices import SolveFrame, VertexView, edge_reach, virtual_vertex
 
 wp.set_module_options({"enable_backward": False})
 

@@ -15,7 +15,7 @@ import numpy as np
 import warp as wp
 
 from warp_reflect import bvh
-from warp_reflect.layers import Camera, GBuffer, MirrorPixels, ReflectionLayer, Reflector
+from warp_reflect.layers import Camera, GBuffer, MirrorPixels, ReflectionLayer, Reflector, add_statistics
 from warp_reflect.scene import Scene
 from warp_reflect.settings import Settings
 
@@ -82,9 +82,8 @@ def reflect(
             whole[name][chosen] = getattr(answer, name).numpy()
         layer.history[number] = answer.history
         layer.statistics["pieces"] += 1
-        for sums, addends in ((layer.statistics, answer.statistics), (layer.timings, answer.timings)):
-            for name, value in addends.items():
-                sums[name] = sums.get(name, 0) + value
+        add_statistics(layer.statistics, answer.statistics)
+        add_statistics(layer.timings, answer.timings)
     for name in LAYER_ARRAYS:
         wp.copy(getattr(layer, name), wp.array(whole[name], dtype=getattr(layer, name).dtype, device=scene.device))
     left = wp.array(np.flatnonzero(numbers == 0).astype(np.int32), dtype=int, device=scene.device)

@@ -18,7 +18,7 @@ from warp_reflect.layers import Camera, CameraView, GBuffer, MirrorPixels, Refle
 from warp_reflect.scene import PartRange, Scene
 from warp_reflect.settings import Settings, Status, Technique
 from warp_reflect.techniques import forward
-from warp_reflect.techniques.forward import SolveFrame, VertexView
+from warp_reflect.techniques.vertices import SolveFrame, VertexView
 
 wp.set_module_options({"enable_backward": False})
 
@@ -51,7 +51,7 @@ def mirror_kernel(
 ):
     """One thread per scene vertex: its mirror image, if it lies on the eye's side."""
     i = first + wp.tid()
-    if i >= own_first and i < own_first + own_count:
+    if (i >= own_first and i < own_first + own_count) or int(out_vertex.status[i]) != 0:
         return
     q = frame.unit_from_scene * points[i] + frame.unit_offset
     if q[2] * wp.sign(frame.eye[2]) <= 0.0:
@@ -96,6 +96,13 @@ def applies(scene: Scene, reflector: Reflector) -> tuple[bool, str]:
 def prepare(scene: Scene, reflector: Reflector, settings: Settings) -> Prepared:
     """The plane through the mirror's points."""
     point, normal, size = _plane(scene, scene.parts[reflector.part])
+    matrix = plane_frame(point, normal, size)
+    # A plane never sees itself, closed or not.
+    return Prepared(replace(reflector, convex=True), matrix)
+
+
+def plane_frame(point: np.ndarray, normal: np.ndarray, size: float) -> np.ndarray:
+    """float64 [4, 4]: the similarity that puts a plane at z = 0, its unit normal up, and `size` to 1."""
     # Any rotation that takes the normal to +z: rows are an orthonormal basis.
     helper = np.eye(3)[np.abs(normal).argmin()]
     x = np.cross(helper, normal)
@@ -103,8 +110,7 @@ def prepare(scene: Scene, reflector: Reflector, settings: Settings) -> Prepared:
     matrix = np.eye(4)
     matrix[:3, :3] = np.stack([x, np.cross(normal, x), normal]) / size
     matrix[:3, 3] = -matrix[:3, :3] @ point
-    # A plane never sees itself, closed or not.
-    return Prepared(replace(reflector, convex=True), matrix)
+    return matrix
 
 
 def reflect(

@@ -22,8 +22,8 @@ from warp_reflect.reflector_maps import ReflectorMap, ReflectorMapView
 from warp_reflect.scene import PartRange, Scene
 from warp_reflect.settings import Settings, Technique
 from warp_reflect.techniques import baking, forward, grid
-from warp_reflect.techniques.forward import SolveFrame, VertexView
 from warp_reflect.techniques.map_search import SearchSettings, is_visible, search_settings, solve_vertex
+from warp_reflect.techniques.vertices import SolveFrame, VertexView, empty_vertices
 
 wp.set_module_options({"enable_backward": False})
 
@@ -48,7 +48,7 @@ def search_kernel(
 ):
     """One thread per scene vertex; vertices of the reflector itself have no picture."""
     i = first + wp.tid()
-    if i >= own_first and i < own_first + own_count:
+    if (i >= own_first and i < own_first + own_count) or int(out_vertex.status[i]) != 0:
         return
     target = frame.unit_from_scene * points[i] + frame.unit_offset
     seed = wp.vec3(0.0, 0.0, 0.0)
@@ -237,7 +237,7 @@ def reflect(
             search(points, own, frame, warm, out_vertex)
             return
         positions = settings.grid_kind == "position"
-        node = forward.empty_vertices(prepared.grid.node_count, scene.device, with_position=positions)
+        node = empty_vertices(prepared.grid.node_count, scene.device, with_position=positions)
         search(prepared.grid.view.nodes, [0, 0], frame, False, node)
         grid.interpolate(
             scene,
@@ -275,4 +275,5 @@ def reflect(
         camera,
         settings,
         history,
+        prepared.map.view.greatest_curvature,
     )

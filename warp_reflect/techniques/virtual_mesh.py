@@ -23,6 +23,9 @@ CONVERGED = wp.constant(int(Status.CONVERGED))
 CUT_MAX = wp.constant(32)  # pieces along an edge; a lattice of 32 has 1024 triangles
 STRADDLING_MAX = 4  # pieces of a triangle that is partly hidden: the estimate grows without bound at grazing incidence
 CUT_SLACK = 1.5  # the tolerance is divided by it when cutting, so that a moving eye does not cut anew every frame
+# Of the triangles that are cut: as many may want more pieces before everything is cut anew for a moving eye. The estimate
+# of a triangle at the hidden boundary grows without bound, and there are always some.
+LATE_SHARE = 0.02
 BUDGET_SHARE = 2.0  # new triangles per triangle of the scene (beside BUDGET_MIN) before the tolerance is relaxed
 BUDGET_MIN = 20000
 RELAX = 2.0  # factor of the tolerance per attempt to meet the budget

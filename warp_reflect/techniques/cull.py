@@ -1,0 +1,75 @@
+"""Whole objects that a mirror cannot show, found by the corners of their boxes before any vertex is searched.
+
+What lies behind a convex body as seen from the eye is convex (so is the half space behind a plane): an object whose box
+has all its corners there is hidden. An object whose box appears, bent edges included, beside the pixels at which the
+mirror is seen is not shown either.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import warp as wp
+
+from warp_reflect import raster
+from warp_reflect.layers import Camera, MirrorPixels
+from warp_reflect.scene import Scene
+from warp_reflect.settings import Status
+from warp_reflect.techniques import virtual_mesh
+from warp_reflect.techniques.vertices import VertexView
+
+# Corners solved per vertex of the scene at most: beyond it the boxes cost more than they can save.
+CORNER_SHARE = 0.1
+# An edge's picture bends by (length / reach)^2 radians where the estimate holds; it is trusted up to here, twice over.
+BEND_MAX = 0.1
+BEND_SLACK = 2.0
+
+
+def settle_culled(
+    scene: Scene,
+    solve: Callable,
+    pixels: MirrorPixels,
+    camera: Camera,
+    unit_per_scene: float,
+    out_vertex: VertexView,
+) -> int:
+    """Settle the vertices of objects that the mirror cannot show as `Status.UNREFLECTED`.
+
+    Args:
+        solve: points vec3 [n] -> `VertexView` of them.
+        pixels: The mirror's pixels; the mirror is convex or a plane.
+        unit_per_scene: Scale of the solver's frame.
+        out_vertex: The scene's own vertices come first.
+
+    Returns:
+        How many vertices.
+    """
+    first, count, corners = scene.boxes
+    if not 0 < 8 * len(first) <= CORNER_SHARE * scene.vertex_count:
+        return 0
+    solved = solve(wp.array(corners.reshape(-1, 3).astype(np.float32), dtype=wp.vec3, device=scene.device))
+    status = solved.status.numpy().reshape(-1, 8)
+    hidden = (status == int(Status.HIDDEN)).all(axis=1)
+    gone = np.flatnonzero(hidden | _beside(solved, status, corners, pixels, camera, unit_per_scene))
+    for k in gone:
+        members = slice(int(first[k]), int(first[k] + count[k]))
+        out_vertex.status[members].fill_(int(Status.UNREFLECTED))
+        out_vertex.screen[members].fill_(wp.vec4(0.0, 0.0, raster.DROPPED, 0.0))
+    return int(count[gone].sum())
+
+
+def _beside(solved, status, corners, pixels, camera, unit_per_scene) -> np.ndarray:
+    """Boxes whose picture lies outside the mirror's pixels by more than its edges can bend."""
+    screen = solved.screen.numpy().reshape(-1, 8, 4).astype(np.float64)
+    reach = solved.reach.numpy().reshape(-1, 8).astype(np.float64)
+    diagonal = np.linalg.norm(corners[:, 7] - corners[:, 0], axis=1) * unit_per_scene
+    least = np.where(reach > 0.0, reach, np.inf).min(axis=1)
+    bend = (diagonal / least) ** 2
+    seen = (status == int(Status.CONVERGED)).all(axis=1) & (screen[..., 2] > 0.0).all(axis=1) & (bend < BEND_MAX)
+    margin = float(virtual_mesh.BOX_MARGIN) + BEND_SLACK * bend * max(camera.fx, camera.fy)
+    low, high = screen[..., :2].min(axis=1), screen[..., :2].max(axis=1)
+    x0, y0, x1, y1 = pixels.box
+    outside = (high[:, 0] + margin < x0) | (low[:, 0] - margin > x1)
+    outside |= (high[:, 1] + margin < y0) | (low[:, 1] - margin > y1)
+    return seen & outside
