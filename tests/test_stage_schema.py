@@ -26,6 +26,9 @@ TYPES = {
     "technique": Sdf.ValueTypeNames.Token,
     "layout": Sdf.ValueTypeNames.Token,
     "map": Sdf.ValueTypeNames.Asset,
+    "mapResolution": Sdf.ValueTypeNames.Int,
+    "mapGeometry": Sdf.ValueTypeNames.StringArray,
+    "unitFromBody": Sdf.ValueTypeNames.Matrix4dArray,
 }
 # A process of its own: whether the library learns of the schemas is settled when it first needs any.
 CHILD = """
@@ -90,6 +93,8 @@ def test_schema_files_are_part_of_the_package():
     shipped = {p.name for pattern in table["warp_reflect"] for p in (root / "warp_reflect").glob(pattern)}
     assert {p.name for p in PLUGIN.iterdir()} == {"plugInfo.json", "generatedSchema.usda"} <= shipped
     layer = Sdf.Layer.FindOrOpen(str(PLUGIN / "generatedSchema.usda"))
+    for name, kind in TYPES.items():
+        assert layer.GetAttributeAtPath(f"/{MIRROR_API}.warp_reflect:{name}").typeName == kind
     declared = json.loads((PLUGIN / "plugInfo.json").read_text())["Plugins"][0]["Info"]["Types"].values()
     assert {prim.name for prim in layer.rootPrims} == {each["alias"]["UsdSchemaBase"] for each in declared}
 
@@ -219,22 +224,13 @@ def test_attributes_of_another_type_are_told(stage):
     assert any("warp_reflect:include: got 'no', expected a bool" in t for t in notes(read_stage(samples.saved(stage))))
 
 
-def test_maps_are_resolved_and_missing_ones_told(stage, tmp_path):
-    (tmp_path / "ball.exr").touch()
-    asked(samples.add_quad(stage, "/A").GetPrim(), map=Sdf.AssetPath("./ball.exr"), layout="nodes")
-    asked(samples.add_quad(stage, "/B").GetPrim(), map=Sdf.AssetPath("./lost.exr"))
-    data = read_stage(samples.saved(stage))
-    found = materials(data)
-    assert found["/A:0"].mirror.map_file == str(tmp_path / "ball.exr") and found["/A:0"].mirror.map_layout == "nodes"
-    assert found["/B:0"].mirror.map_file == ""
-    assert any("/B: warp_reflect:map: @./lost.exr@: no such file" in text for text in notes(data))
-
-
 def test_places_of_environment_maps_are_read(stage, tmp_path):
     (tmp_path / "room.exr").touch()
     probe = UsdGeom.Xform.Define(stage, "/World/Probe")
     probe.AddTranslateOp().Set(Gf.Vec3d(1, 2, 3))
     asked(probe.GetPrim(), ENVIRONMENT_MAP_API, map=Sdf.AssetPath("./room.exr"), layout="cube")
+    lost = UsdGeom.Xform.Define(stage, "/Lost")
+    asked(lost.GetPrim(), ENVIRONMENT_MAP_API, map=Sdf.AssetPath("./lost.exr"))
     for path, fault in (("/Flat", "singular"), ("/Hidden", "")):
         other = UsdGeom.Xform.Define(stage, path)
         asked(other.GetPrim(), ENVIRONMENT_MAP_API)
@@ -243,7 +239,9 @@ def test_places_of_environment_maps_are_read(stage, tmp_path):
         else:
             other.MakeInvisible()
     data = read_stage(samples.saved(stage))
-    (found,) = data.environment_maps
+    missing, found = sorted(data.environment_maps, key=lambda each: each.path)
+    assert (missing.path, missing.map_file) == ("/Lost", "")
+    assert any("/Lost: warp_reflect:map: @./lost.exr@: no such file" in text for text in notes(data))
     assert (found.path, found.map_file, found.map_layout) == ("/World/Probe", str(tmp_path / "room.exr"), "cube")
     np.testing.assert_array_equal(found.world_from_map[:3, 3], [1, 2, 3])
     assert any(text.startswith("/Flat: ") and "singular" in text for text in notes(data))

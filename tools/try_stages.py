@@ -42,6 +42,7 @@ class Row:
     stage: str
     triangles: int = 0
     seconds: float = 0.0
+    cpu_seconds: float = 0.0
     megabytes: float = 0.0
     mirrors: int = 0
     notes: int = 0
@@ -67,7 +68,9 @@ def main() -> int:
     for folder in arguments.folder:
         files += [(p, str(p.relative_to(folder))) for p in sorted(folder.rglob("*")) if p.suffix in SUFFIXES]
     expected = {path.resolve(): fails for folder in arguments.folder for path, fails in expectations(folder).items()}
-    print(f"{'triangles':>10} {'s':>6} {'MB':>6} {'mirrors':>7} {'notes':>5} {'status':7}  stage", flush=True)
+    print(
+        f"{'triangles':>10} {'s':>6} {'cpu s':>6} {'MB':>6} {'mirrors':>7} {'notes':>5} {'status':7}  stage", flush=True
+    )
 
     def judged(file: tuple[Path, str]) -> Row:
         row = try_one(*file, arguments.size, arguments.pictures)
@@ -82,8 +85,8 @@ def main() -> int:
         for row in pool.map(judged, files):
             rows.append(row)
             print(
-                f"{row.triangles:10,} {row.seconds:6.1f} {row.megabytes:6.0f} {row.mirrors:7d} {row.notes:5d} "
-                f"{row.status:7}  {row.stage}" + (f": {row.line}" if row.line else ""),
+                f"{row.triangles:10,} {row.seconds:6.1f} {row.cpu_seconds:6.1f} {row.megabytes:6.0f} "
+                f"{row.mirrors:7d} {row.notes:5d} {row.status:7}  {row.stage}" + (f": {row.line}" if row.line else ""),
                 flush=True,
             )
     if arguments.json:
@@ -119,7 +122,7 @@ def print_summary(rows: list[Row]) -> None:
     print(
         f"{len(rows)} files: {ended['drawn']} drawn, {ended['refused']} refused with one line, {ended['FAULT']} faults"
     )
-    for name in ("seconds", "megabytes", "triangles", "notes"):
+    for name in ("seconds", "cpu_seconds", "megabytes", "triangles", "notes"):
         worst = max(rows, key=lambda row: getattr(row, name))
         print(f"most {name}: {getattr(worst, name):,.0f} ({worst.stage})")
 
@@ -139,6 +142,7 @@ def try_one(path: Path, name: str, size: str, pictures: Path | None) -> Row:
         killer.cancel()
         child.returncode = os.waitstatus_to_exitcode(status)
         row.seconds, row.megabytes = time.perf_counter() - started, used.ru_maxrss / KIB_PER_MB
+        row.cpu_seconds = used.ru_utime + used.ru_stime
         for stream in (out, err):
             stream.seek(0)
         answer = out.read().decode(errors="replace")

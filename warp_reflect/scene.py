@@ -121,8 +121,6 @@ class MirrorData:
     path: str  # the prim with the API, or the pattern
     include: bool = True  # False: never a mirror
     technique: str = "auto"  # as authored: not checked
-    map_file: str = ""  # a baked reflector map, resolved; empty: none
-    map_layout: str = ""
     reflects: tuple[str, ...] | None = None  # prims that are seen in it, with all below; None: everything
 
 

@@ -39,7 +39,7 @@ def applied(prim) -> tuple[str, ...]:
 
 
 def read_mirror(prim, intake: Intake, collections: dict[str, tuple[str, ...]]) -> Choice | None:
-    """What a prim with `MIRROR_API` asks for; None (with a note) where that cannot be used.
+    """What a prim with `MIRROR_API` asks for, but its baked maps (`baked.py`); None (with a note) where it cannot be used.
 
     Args:
         prim: The prim.
@@ -55,8 +55,6 @@ def read_mirror(prim, intake: Intake, collections: dict[str, tuple[str, ...]]) -
                 str(prim.GetPath()),
                 include is not False,
                 str(_value(prim, "technique", intake) or "auto"),
-                _map_file(prim, intake),
-                str(_value(prim, "layout", intake) or ""),
                 collections.get(f"{prim.GetPath()}.{REFLECTS}"),
             ),
             *(_share(prim, name, intake) for name in ("metallic", "roughness")),
@@ -77,8 +75,9 @@ def read_environment_map(prim, world_from_map: np.ndarray, intake: Intake) -> En
     fault = transform_fault(world_from_map)
     if fault:
         raise BadPrim(fault)
-    layout = str(_value(prim, "layout", intake) or "")
-    return EnvironmentMapData(str(prim.GetPath()), world_from_map, _map_file(prim, intake), layout)
+    attribute, layout = _attribute(prim, "map"), str(_value(prim, "layout", intake) or "")
+    file = resolve_asset(attribute.Get(intake.time), attribute, intake) if attribute else ""
+    return EnvironmentMapData(str(prim.GetPath()), world_from_map, file, layout)
 
 
 def _attribute(prim, name: str):
@@ -108,8 +107,3 @@ def _color(prim, intake: Intake) -> tuple[float, float, float] | None:
     if color.shape != (3,) or color.dtype.kind not in "fiu" or not ((color >= 0.0) & (color <= 1.0)).all():
         raise BadPrim(f"{NAMESPACE}:color: got {value}, expected 3 numbers from 0 to 1")
     return tuple(float(v) for v in color)
-
-
-def _map_file(prim, intake: Intake) -> str:
-    attribute = _attribute(prim, "map")
-    return resolve_asset(attribute.Get(intake.time), attribute, intake) if attribute else ""
