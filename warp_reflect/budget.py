@@ -13,11 +13,19 @@ RASTER_US = 0.35  # per virtual triangle, the clipping at the hidden boundary in
 REFINE_US = 0.18  # per mirror pixel
 TRACE_US = 0.6  # per mirror pixel at 60,000 triangles; grows with their logarithm, which is left out
 DOUBT_SHARE = 0.05  # of the mirror pixels that refinement leaves to the BVH
+BRANCHES_US = 20.0  # per vertex of the scene, where all its reflection points on a concave side are searched (4 a search)
+OWN_BODY_US = 0.25  # per pixel of a mirror that may see itself
 CURVED_SHARE = 2.0  # virtual vertices and triangles per one of the scene, where a curved mirror bends edges
 
 
-def predict(scene: Scene, technique: str, pixels: int, settings: Settings) -> dict[str, float]:
-    """Predicted `error_px`, `ms` per frame and prepared `bytes` of a reflector."""
+def predict(
+    scene: Scene, technique: str, pixels: int, settings: Settings, branches: bool = False
+) -> dict[str, float]:
+    """Predicted `error_px`, `ms` per frame and prepared `bytes` of a reflector.
+
+    Args:
+        branches: The mirror is seen from within, and every vertex may appear several times (`quadric` alone).
+    """
     threads = thread_count(scene.device, settings.threads)
     traced = pixels * TRACE_US
     if technique == "raytraced" or pixels == 0:
@@ -25,9 +33,11 @@ def predict(scene: Scene, technique: str, pixels: int, settings: Settings) -> di
     forward = scene.vertex_count * SEARCH_US + scene.triangle_count * RASTER_US
     if technique != "planar":
         forward *= CURVED_SHARE
+    if branches:
+        forward += scene.vertex_count * BRANCHES_US + pixels * OWN_BODY_US
     if settings.refine == "exact":
         forward += pixels * (REFINE_US + DOUBT_SHARE * TRACE_US)
-    bytes_ = 6 * settings.map_resolution**2 * 32
+    bytes_ = 6 * settings.map_resolution**2 * 32 if technique == "reflector_map" else 0
     # Straight virtual edges between exact vertices: the papers' picture is wrong by about a pixel at silhouettes.
     error = 0.0 if settings.refine == "exact" else 1.0
     return {"error_px": error, "ms": 1e-3 * forward / threads, "bytes": bytes_}

@@ -15,7 +15,8 @@ from warp_reflect.settings import Settings
 from warp_reflect.techniques import TECHNIQUES
 
 CLEARCOAT_MIN = 0.5  # a coat from here on is a mirror of its own (design: clearcoat >= 0.5)
-PREFERRED = ("planar", "reflector_map")  # the exact and cheap first
+PREFERRED = ("planar", "quadric", "reflector_map")  # the exact and cheap first
+JUDGED_IN_PIXELS = ("quadric",)  # whether they apply depends on the view
 METHODS = ("auto", "reference")
 REC709_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 DEFAULT_SIZE = (960, 540)  # usdrecord's default width at 16:9
@@ -159,6 +160,9 @@ def make_plan(
         _row(scene, view, settings, method, number, part_index, part, weight, pixels[part_index], notes)
         for number, (part_index, part, weight) in enumerate(found, 1)
     ]
+    bumpy = [scene.data.materials[part.material] for _, part, _ in found]
+    for path in dict.fromkeys(material.path for material in bumpy if "normal" in material.textures):
+        notes.append(Note(path, "texture of normal: a mirror reflects at the surface itself; its normal map is not used"))
     made = Plan(scene, view, settings, method, rows, notes)
     if earlier is not None and earlier.scene.shares_world(scene):
         before = {row.reflector: row for row in earlier.rows}
@@ -232,7 +236,7 @@ def _row(scene, camera, settings, method, number, part_index, part, weight, pixe
     technique, forced, reason = _technique(scene, reflector, camera, method, pixels, settings, part, notes)
     if method == "reference":
         settings = settings.replace(refine="off")
-    predicted = budget.predict(scene, technique, pixels, settings)
+    predicted = budget.predict(scene, technique, pixels, settings, _branches(scene, reflector, camera, technique))
     return PlanRow(
         reflector,
         part.prim_path,
@@ -271,7 +275,7 @@ def _technique(scene, reflector, camera, method, pixels, settings, part, notes) 
         if not applies:
             reasons.append(f"{name}: {reason}")
             continue
-        forward = budget.predict(scene, name, pixels, settings)["ms"]
+        forward = budget.predict(scene, name, pixels, settings, _branches(scene, reflector, camera, name))["ms"]
         traced = budget.predict(scene, "raytraced", pixels, settings)["ms"]
         if traced < forward:
             return (
@@ -284,9 +288,15 @@ def _technique(scene, reflector, camera, method, pixels, settings, part, notes) 
     return "raytraced", False, "; ".join(reasons)
 
 
+def _branches(scene, reflector, camera: Camera, technique: str) -> bool:
+    return technique == "quadric" and TECHNIQUES[technique].has_branches(scene, reflector, camera)
+
+
 def _applies(scene, reflector, camera: Camera, method: str) -> tuple[bool, str]:
     if camera.orthographic and method != "raytraced":
         return False, "orthographic camera: there is no eye to reflect from"
+    if method in JUDGED_IN_PIXELS:
+        return TECHNIQUES[method].applies(scene, reflector, camera)
     return TECHNIQUES[method].applies(scene, reflector)
 
 

@@ -299,6 +299,8 @@ class Scene:
         self._reload = reload
         self._bodies: dict[int, Body] = {}
         self._part_tracers: dict = {}
+        self.fits: dict = {}  # part -> the quadric nearest to it, found by the technique that asks
+        self.segmentations: dict = {}  # part -> its sheets (`segments.Segmentation`), likewise
         self._pyramids: dict = {}
         if any(material.textures for material in data.materials):
             from warp_reflect import textures

@@ -239,7 +239,7 @@ def reflect(
             )
         solve_vertices(mesh.points, True, frame, history is not None, vertices)
     with timer("tessellate"):
-        mesh, vertices = _cut_where_bent(
+        mesh, vertices = cut_where_bent(
             scene, part, mesh, vertices, frame, solve_vertices, solve_apart, unit_per_scene, camera, pixels, settings
         )
         layer.history = History(mesh, vertices, camera.eye)
@@ -281,7 +281,7 @@ def reflect(
     return layer
 
 
-def _cut_where_bent(
+def cut_where_bent(
     scene, part, mesh, vertices, frame, solve_vertices, solve_apart, unit_per_scene, camera, pixels, settings
 ) -> tuple[VirtualMesh, VertexView]:
     """Cut triangles whose picture would bend by more than `edge_px`; keep the mesh where it is fine enough."""
@@ -314,7 +314,8 @@ def _cut_where_bent(
     base = mesh.base_count
     known = empty_vertices(finer.vertex_count, scene.device, with_position=len(vertices.position) > 0)
     copy_vertices(known, vertices, base)
-    solve_vertices(finer.points[base:], False, frame, False, vertices_from(known, base))
+    if finer.vertex_count > base:  # as measured, nothing may be left to cut
+        solve_vertices(finer.points[base:], False, frame, False, vertices_from(known, base))
     return finer, known
 
 

@@ -8,6 +8,7 @@ through here; what no piece holds is traced.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 from types import ModuleType
 
@@ -30,11 +31,14 @@ class Piece:
         triangles: int [n], ids of its triangles in the scene.
         technique: A module with `reflect`.
         prepared: What that module's `prepare` would give; its reflector's id is the piece's number, 1-based.
+        holds: (points [n, 3], normals [n, 3] on the eye's side, scene frame) -> bool [n]: which of its pixels it holds
+            (one side of an open surface); None: all.
     """
 
     triangles: np.ndarray
     technique: ModuleType
     prepared: object
+    holds: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
 
 
 def reflect(
@@ -60,10 +64,7 @@ def reflect(
     part = scene.parts[reflector.part]
     width, height = gbuffer.camera.size
     pixel = pixels.pixel.numpy()
-    table = np.zeros(part.triangle_count, np.int32)
-    for number, piece in enumerate(pieces, 1):
-        table[piece.triangles - part.first_triangle] = number
-    numbers = table[gbuffer.triangle.numpy()[pixel] - part.first_triangle]
+    numbers = _numbers(pieces, pixels, gbuffer.triangle.numpy()[pixel], part.first_triangle, part.triangle_count)
     mask = np.zeros(width * height, np.int32)
     mask[pixel] = numbers
     masked = dataclasses.replace(gbuffer, reflector_id=wp.array(mask, dtype=int, device=scene.device))
@@ -92,3 +93,21 @@ def reflect(
     )
     layer.statistics["bvh"] = layer.statistics.get("bvh", 0) + traced
     return layer
+
+
+def _numbers(
+    pieces: list[Piece], pixels: MirrorPixels, triangle: np.ndarray, first_triangle: int, triangle_count: int
+) -> np.ndarray:
+    """The number of the first piece that holds each pixel, int32; 0 none."""
+    numbers = np.zeros(len(triangle), np.int32)
+    point, normal = None, None
+    for number, piece in enumerate(pieces, 1):
+        member = np.zeros(triangle_count, bool)
+        member[piece.triangles - first_triangle] = True
+        chosen = np.flatnonzero(member[triangle - first_triangle] & (numbers == 0))
+        if piece.holds is not None and len(chosen):
+            if point is None:
+                point, normal = pixels.point.numpy(), pixels.normal.numpy()
+            chosen = chosen[piece.holds(point[chosen], normal[chosen])]
+        numbers[chosen] = number
+    return numbers
