@@ -315,7 +315,6 @@ def cut_where_bent(
     known = empty_vertices(finer.vertex_count, scene.device, with_position=len(vertices.position) > 0)
     copy_vertices(known, vertices, base)
     if finer.vertex_count > base:  # as measured, nothing may be left to cut
-        if finer.vertex_count > base:  # as measured, nothing may be left to cut
         solve_vertices(finer.points[base:], False, frame, False, vertices_from(known, base))
     return finer, known
 
