@@ -88,8 +88,8 @@ SURFACES = {
 }
 NORMAL_INPUTS = ("normal", "geometry_normal")
 # Inputs that change the picture and are not simulated: noted where they are driven, or not this value.
+UNUSED_PREVIEW = {"displacement": 0.0}
 UNUSED = {
-    "displacement": 0.0,
     "specular": 1.0,
     "specular_weight": 1.0,
     "transmission": 0.0,
@@ -281,7 +281,8 @@ def _read_surface(shader: UsdShade.Shader, parameters, path: str, intake: Intake
     unshaded = sorted(set(textures) - {*SHADED_TEXTURES, NORMAL})
     if unshaded:
         intake.note(path, f"textures of {', '.join(unshaded)} are read but not shaded; constants are used")
-    for name, idle in UNUSED.items():
+    unused = UNUSED_PREVIEW if parameters is _PREVIEW else UNUSED
+    for name, idle in unused.items():
         found = shader.GetInput(name)
         if found and (found.HasConnectedSource() or (idle is not None and found.Get(intake.time) not in (None, idle))):
             intake.note(path, f"inputs:{name} is not used")
