@@ -9,7 +9,7 @@ from rooms import identical, placed, plane_room, render, room, sphere
 import warp_reflect as wr
 from warp_reflect.layers import Camera
 from warp_reflect.settings import Status
-from warp_reflect.techniques import grid, virtual_mesh
+from warp_reflect.techniques import virtual_mesh
 
 
 @pytest.fixture(scope="module")
@@ -54,38 +54,6 @@ def test_plane_seen_edge_on_or_from_its_plane_is_finite():
 @pytest.mark.parametrize("settings", [{}, {"grid_share": 0.1}, {"grid_share": 0.1, "grid_kind": "position"}])
 def test_refined_frame_equals_the_reference(ball_room, settings):
     assert identical(render(ball_room, "reflector_map", **settings), render(ball_room, "reference")) >= 0.999
-
-
-def test_grid_of_directions_beats_grid_of_positions(ball_room):
-    """The same cells, without refinement: one exact step a vertex leaves fewer wrong pixels."""
-    reference = render(ball_room, "reference")
-    errors = {}
-    for kind in grid_kinds():
-        frame = render(ball_room, "reflector_map", refine="off", grid_share=0.1, grid_kind=kind, edge_px=0.0)
-        both = (frame["reflectedId"] > 0) & (reference["reflectedId"] == frame["reflectedId"])
-        distance = np.linalg.norm(frame.relative("reflectedPoint") - reference.relative("reflectedPoint"), axis=-1)
-        errors[kind] = np.median(distance[both])
-    assert errors["direction"] < errors["position"]
-
-
-def grid_kinds():
-    from warp_reflect.settings import GRID_KINDS
-
-    return GRID_KINDS
-
-
-def test_grid_holds_the_asked_share_and_every_vertex(ball_room):
-    cells = grid.build(ball_room, ball_room.parts[0], 0.1)
-    assert 0.04 < cells.share <= 0.1
-    local = cells.view.vertex_local.numpy()
-    assert (local >= 0).all() and (local <= 1).all()
-    cell = cells.view.vertex_cell.numpy()
-    nodes = cells.view.nodes.numpy()[cells.view.cell_nodes.numpy()]
-    inside = cell >= 0
-    low, high = nodes[cell[inside], 0], nodes[cell[inside], 7]
-    np.testing.assert_allclose(
-        low + local[inside] * (high - low), ball_room.host_points[inside], atol=1e-5 * ball_room.size
-    )
 
 
 def test_warm_start_gives_the_same_hits(ball_room):

@@ -57,7 +57,7 @@ class Technique(IntEnum):
 
 
 SEARCHES = ("newton", "midpoint")
-GRID_KINDS = ("direction", "position")
+GRID_KINDS = ("direction", "slope", "position")
 REFINEMENTS = ("exact", "off")
 OCCLUSIONS = ("exact", "painter")
 
@@ -75,9 +75,11 @@ class Settings:
     map_resolution: int = 128
     """Nodes along a cube edge of a reflector map. [nodes]"""
     grid_share: float = 0.0
-    """Interpolation grid: solved nodes as a fraction of the vertices; 0: every vertex is searched."""
+    """Interpolation grid: nodes as a fraction of the vertices; 0: every vertex is searched (but see `max_error_px`)."""
     grid_kind: str = "direction"
-    """What the grid holds: `direction` (one exact step a vertex) or `position` (the paper's virtual positions)."""
+    """The grid holds: `direction` (one exact step a vertex), `slope` (positions, derivatives), `position` (the paper's)."""
+    max_error_px: float = 0.0
+    """Vertices are interpolated over cells of any size while their estimated error stays below this; 0: off. [pixels]"""
     reuse_px: float = 0.0
     """A virtual vertex of the previous frame is kept while the bound on its drift stays below this; 0: off. [pixels]"""
     occlusion: str = "exact"
@@ -103,6 +105,7 @@ class Settings:
         _require(self.search in SEARCHES, "search", self.search, f"one of {', '.join(SEARCHES)}")
         _require(0.0 <= self.grid_share <= 1.0, "grid_share", self.grid_share, "0 to 1")
         _require(self.grid_kind in GRID_KINDS, "grid_kind", self.grid_kind, f"one of {', '.join(GRID_KINDS)}")
+        _require(0.0 <= self.max_error_px <= 1.0e6, "max_error_px", self.max_error_px, "0 (off) or a number of pixels")
         _require(0.0 <= self.reuse_px <= 1.0e6, "reuse_px", self.reuse_px, "0 (off) or a number of pixels")
         _require(self.occlusion in OCCLUSIONS, "occlusion", self.occlusion, f"one of {', '.join(OCCLUSIONS)}")
         painted = self.occlusion == "painter" and self.refine != "off"

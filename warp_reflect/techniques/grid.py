@@ -1,13 +1,19 @@
 """The interpolation grid: solve the corners of the cells that hold vertices, interpolate the vertices.
 
-Source: Estalella et al., "Accurate Interactive Specular Reflections on Curved Objects" (2005), section 5. What differs:
-by default the grid holds *reflection directions* and each vertex takes one exact step from the interpolated one (fourth
-order instead of second, at the same count of solves); `grid_kind="position"` is the paper's interpolation of virtual
-positions. Cells with a corner behind the reflector are not interpolated: their vertices are solved one by one.
+Source: Estalella et al., "Accurate Interactive Specular Reflections on Curved Objects" (2005), section 5, and the
+level-of-detail hierarchy of its section 8. What differs:
+- the cells are those of one octree over the scene, so that small meshes share them;
+- which level a vertex is interpolated from is decided per view, by an estimate of the interpolation error on the screen
+  (`vertices.edge_reach`): down to `max_error_px`, or until the solves asked for by `grid_share` are spent;
+- by default the grid holds *reflection directions* and each vertex takes one exact step from the interpolated one (fourth
+  order instead of second, at the same count of solves); `grid_kind="slope"` holds virtual positions and their derivatives
+  (third order, no map read per vertex); `grid_kind="position"` is the paper's interpolation of virtual positions;
+- vertices of cells that straddle the hidden boundary, or whose corners would outnumber them, are solved one by one.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,271 +22,828 @@ import warp as wp
 from warp_reflect.cubemap import project_to_cube
 from warp_reflect.launch import launch
 from warp_reflect.layers import Camera, CameraView, project
-from warp_reflect.reflector_maps import ReflectorMap, ReflectorMapView, sample_map
+from warp_reflect.optics import tangent_basis
+from warp_reflect.reflector_maps import MapSample, ReflectorMap, ReflectorMapView, sample_map
 from warp_reflect.scene import PartRange, Scene
 from warp_reflect.settings import Settings, Status
-from warp_reflect.techniques.map_search import (
-    ACCEPTED,
-    SearchSettings,
-    measure,
-    newton_step,
-    solve_vertex,
-    step_on_cube,
+from warp_reflect.techniques import octree
+from warp_reflect.techniques.map_search import ACCEPTED, measure, newton_step, step_on_cube
+from warp_reflect.techniques.octree import CORNER_COUNT, Octree
+from warp_reflect.techniques.vertices import (
+    ESTIMATE,
+    SolveFrame,
+    VertexView,
+    edge_reach,
+    empty_vertices,
+    vertices_from,
+    virtual_vertex,
 )
-from warp_reflect.techniques.vertices import SolveFrame, VertexView, edge_reach, virtual_vertex
 
 wp.set_module_options({"enable_backward": False})
 
-CORNER_COUNT = 8
-FIT_STEPS = 14  # bisections of a cell size over FIT_SPAN: within 1 % of the share asked
-FIT_SPAN = 1.0e3  # from the mesh's extent down to this part of it
-CELL_LIMIT = 1 << 20  # cells along an axis; keeps cell numbers inside int64
-RESIDUAL_MAX = wp.constant(0.1)  # of an interpolated direction; one step squares it to below 1e-2 of itself
-# Pixels. Virtual positions of a cell whose interpolation is estimated to be wrong by more are not interpolated: a cell as
-# large as the mirror would say nothing. The paper's own grids are wrong by about as much.
-POSITION_PX = 4.0
+START_SHARE = 0.02  # nodes per vertex of the level a frame starts from: it costs little and is rarely good enough
+ROUNDS_MAX = 16
+ROUND_WORTH = 400  # vertices: solving fewer costs less than the launches of another round
+NODES_MAX = 0.5  # nodes per vertex: more save nothing
+BUDGET_ROUNDS = 2  # descents by `grid_share`: the second sees better estimates
+NODES_PER_CELL = 2.5  # of a surface's cells, shared corners counted in parts
+STRADDLING_COUNT = 16.0  # vertices of a cell at the hidden boundary below which nodes cost more than they save
+TOLERANCE_LEAST = 1.0e-3  # pixels: no budget is spent on less
+FIT_STEPS = 24
+ORDERS = {"position": 2, "slope": 3, "direction": 4}  # of the error in a cell's edge
+# Directions from cells judged worse than this often miss ACCEPTED after their step, and would be solved after all.
+DIRECTION_PX = 0.25
+CHUNK = 64  # vertices per thread
+UNSAFE = wp.constant(1.0e30)  # pixels: corners of both kinds, or a cell that may reach around or into the mirror
+NEAR = wp.constant(2.0e30)  # likewise, but one level less may do
+# Interpolation with slopes is wrong by t (1 - t) (1 - 2 t) <= 0.1 of the residual along an edge; terms of fourth order
+# raise the largest error met to this.
+SLOPE_ERROR = wp.constant(0.3)
+HIDDEN_CELL = wp.constant(-1.0)
 SPACE_DIAGONAL = wp.constant(1.7320508)  # of a cube with edge 1
+RESIDUAL_MAX = wp.constant(0.3)  # of an interpolated direction; a step from farther off is not worth its price
 CONVERGED = wp.constant(int(Status.CONVERGED))
 HIDDEN = wp.constant(int(Status.HIDDEN))
 
 
-@wp.struct
-class GridView:
-    nodes: wp.array(dtype=wp.vec3)  # scene frame
-    cell_nodes: wp.array2d(dtype=int)  # [cell_count, 8], corner k at bits (x, y, z) of k
-    vertex_cell: wp.array(dtype=int)  # per scene vertex, -1: solved directly
-    vertex_local: wp.array(dtype=wp.vec3)  # position in the cell, [0, 1]^3
-
-
 @dataclass(frozen=True)
 class Grid:
-    """Cells over the meshes of a scene, one size per instance.
+    """An octree over the vertices of a scene that a mirror reflects.
 
     Attributes:
-        view: For kernels.
-        node_count: Points that are solved.
-        share: node_count / vertices that are interpolated.
+        tree: Its cells; `tree.order` counts `vertices`.
+        vertices: int32 [n], scene vertices along the tree's curve.
+        order, points: The same on the device, and where they lie (scene frame).
+        start: The cells a frame starts from.
     """
 
-    view: GridView
-    node_count: int
-    share: float
+    tree: Octree
+    vertices: np.ndarray
+    order: wp.array
+    points: wp.array
+    start: np.ndarray
+
+
+@wp.struct
+class CellTest:
+    """How the error of a cell is judged."""
+
+    pixels_per_radian: float
+    unit_per_scene: float
+    order: int  # of the error in the cell's edge: 2 positions, 3 with slopes, 4 directions and a step
+    extent: wp.vec3  # half extents of the body, unit frame
+    body_width: float  # twice the least of them
+    body_radius: float  # of a ball around it
+    box: wp.vec4  # of the mirror's pixels: x0, y0, x1, y1
 
 
 @wp.func
-def corner_weight(local: wp.vec3, corner: int) -> float:
-    """Trilinear weight of a cell's corner."""
-    x = wp.where((corner & 1) != 0, local[0], 1.0 - local[0])
-    y = wp.where((corner & 2) != 0, local[1], 1.0 - local[1])
-    z = wp.where((corner & 4) != 0, local[2], 1.0 - local[2])
-    return x * y * z
+def edge_residual(node: VertexView, slope: wp.array(dtype=wp.mat33), a: int, b: int, axis: int, edge: float) -> float:
+    """By how much the mean of the slopes at both ends misses the change along an edge, in radians on the screen.
+
+    h^3 / 12 of the third derivative (the trapezoidal rule); only the part across the line of sight shows.
+    """
+    pa = node.position[a]
+    pb = node.position[b]
+    ja = slope[a]
+    jb = slope[b]
+    half = 0.5 * edge
+    mean = wp.vec3(ja[0, axis] + jb[0, axis], ja[1, axis] + jb[1, axis], ja[2, axis] + jb[2, axis])
+    miss = pb - pa - half * mean
+    along = wp.dot(miss, pa) / wp.max(wp.dot(pa, pa), 1.0e-30)
+    return wp.length(miss - along * pa) / wp.max(wp.length(pa), 1.0e-20)
 
 
 @wp.kernel
-def interpolate_kernel(
+def estimate_kernel(
     first: int,
-    # Scene:
+    # Cells: slots of their corners, edge (unit frame)
+    corner: wp.array2d(dtype=int),
+    edge: wp.array(dtype=float),
+    # Nodes:
+    point: wp.array(dtype=wp.vec3),
+    node: VertexView,
+    slope: wp.array(dtype=wp.mat33),
+    frame: SolveFrame,
+    test: CellTest,
+    out_error: wp.array(dtype=float),
+):
+    """One thread per cell: estimated interpolation error [pixels], HIDDEN_CELL where no vertex has a picture."""
+    i = first + wp.tid()
+    h = edge[i]
+    hidden = int(0)
+    solved = int(0)
+    error = float(0.0)
+    centre = wp.vec3(0.0, 0.0, 0.0)
+    left = float(1.0e30)
+    right = float(-1.0e30)
+    top = float(1.0e30)
+    bottom = float(-1.0e30)
+    for k in range(8):
+        slot = corner[i, k]
+        status = int(node.status[slot])
+        if status == HIDDEN:
+            hidden += 1
+        elif status == CONVERGED:
+            solved += 1
+            # The reflection point lies on the line of sight, where its distance to the point ends the path.
+            q = frame.unit_from_scene * node.position[slot]
+            path = wp.length(q)
+            away = frame.unit_from_scene * point[slot] + frame.unit_offset - frame.eye
+            distance = wp.length(away)
+            spare = path * path - wp.dot(q, away)
+            d_o = path
+            if spare > 0.0:
+                d_o = wp.clamp(0.5 * path * (path * path - distance * distance) / spare, 1.0e-6 * path, path)
+            d_v = path - d_o
+            ratio = h / wp.max(node.reach[slot], 1.0e-20)
+            bend = ratio * ratio  # radians on the screen
+            if test.order == 4:
+                # On the mirror it is d_o times as long, and a Newton step squares it over the length on which the
+                # residual bends: the distance to the point or the body's size.
+                bend = bend * bend * d_o / wp.clamp(d_v, 1.0e-6, 1.0)
+            error = wp.max(error, bend * test.pixels_per_radian)
+            centre += 0.125 * (away + frame.eye)
+            p = node.screen[slot]
+            if p[2] > 0.0:
+                left = wp.min(left, p[0])
+                right = wp.max(right, p[0])
+                top = wp.min(top, p[1])
+                bottom = wp.max(bottom, p[1])
+    if hidden == 8:
+        # What lies behind a convex body is convex: so does the whole cell.
+        out_error[i] = HIDDEN_CELL
+        return
+    if solved < 8:
+        out_error[i] = UNSAFE
+        return
+    # The mirror itself may reach into the cell: the distance from the ball around it to the box around the mirror.
+    gap = wp.vec3(
+        wp.max(wp.abs(centre[0]) - test.extent[0], 0.0),
+        wp.max(wp.abs(centre[1]) - test.extent[1], 0.0),
+        wp.max(wp.abs(centre[2]) - test.extent[2], 0.0),
+    )
+    radius = 0.5 * SPACE_DIAGONAL * h
+    if wp.length(gap) < radius:
+        error = NEAR
+    # So may its shadow, where that is narrower than the cell: the cone from the eye around the ball around the mirror.
+    to_body = wp.length(frame.eye)
+    to_cell = wp.length(centre - frame.eye)
+    if 2.0 * radius > test.body_width * to_cell / to_body and to_cell + radius > to_body - test.body_radius:
+        cone = wp.asin(wp.min(test.body_radius / to_body, 1.0)) + wp.asin(
+            wp.min(radius / wp.max(to_cell, 1.0e-20), 1.0)
+        )
+        if (
+            wp.acos(wp.clamp(-wp.dot(centre - frame.eye, frame.eye) / wp.max(to_cell * to_body, 1.0e-20), -1.0, 1.0))
+            < cone
+        ):
+            error = NEAR
+    if test.order == 3 and error < UNSAFE:
+        bend = float(0.0)
+        for axis in range(3):
+            worst = float(0.0)
+            for k in range(4):
+                # The four edges along an axis: bit `axis` of the corner 0 and 1, the other bits all four values.
+                low_bits = k & ((1 << axis) - 1)
+                a = ((k - low_bits) << 1) | low_bits
+                b = a | (1 << axis)
+                worst = wp.max(
+                    worst, edge_residual(node, slope, corner[i, a], corner[i, b], axis, h / test.unit_per_scene)
+                )
+            bend += worst
+        error = SLOPE_ERROR * bend * test.pixels_per_radian
+    # A vertex far outside the mirror's pixels moves a triangle inside them by less than itself.
+    if right >= left and error < UNSAFE:
+        outside_x = wp.max(wp.max(test.box[0] - right, left - test.box[2]), 0.0)
+        outside_y = wp.max(wp.max(test.box[1] - bottom, top - test.box[3]), 0.0)
+        outside = wp.max(wp.max(outside_x, outside_y) - error, 0.0)
+        error = error / (1.0 + outside / (test.box[2] - test.box[0] + test.box[3] - test.box[1]))
+    out_error[i] = error
+
+
+@wp.struct
+class ChunkView:
+    """Ranges of a grid's vertices, each within one cell."""
+
+    range: wp.array(dtype=wp.vec2i)  # first, count
+    cell: wp.array(dtype=int)
+    corner: wp.array2d(dtype=int)  # per cell: slots of its corners
+    low: wp.array(dtype=wp.vec3)  # per cell: lowest corner
+    inv_edge: wp.array(dtype=float)  # per cell; 0: hidden
+
+
+@wp.struct
+class Trilinear:
+    """A vector as a polynomial of the position in a cell."""
+
+    c: wp.vec3
+    x: wp.vec3
+    y: wp.vec3
+    z: wp.vec3
+    xy: wp.vec3
+    yz: wp.vec3
+    xz: wp.vec3
+    xyz: wp.vec3
+
+
+@wp.func
+def trilinear_of(
+    v0: wp.vec3, v1: wp.vec3, v2: wp.vec3, v3: wp.vec3, v4: wp.vec3, v5: wp.vec3, v6: wp.vec3, v7: wp.vec3
+) -> Trilinear:
+    t = Trilinear()
+    t.c = v0
+    t.x = v1 - v0
+    t.y = v2 - v0
+    t.z = v4 - v0
+    t.xy = v3 - v2 - t.x
+    t.xz = v5 - v4 - t.x
+    t.yz = v6 - v4 - t.y
+    t.xyz = v7 - v6 - v5 + v4 - t.xy
+    return t
+
+
+@wp.func
+def trilinear(values: wp.array(dtype=wp.vec3), corner: wp.array2d(dtype=int), cell: int) -> Trilinear:
+    return trilinear_of(
+        values[corner[cell, 0]],
+        values[corner[cell, 1]],
+        values[corner[cell, 2]],
+        values[corner[cell, 3]],
+        values[corner[cell, 4]],
+        values[corner[cell, 5]],
+        values[corner[cell, 6]],
+        values[corner[cell, 7]],
+    )
+
+
+@wp.func
+def column(m: wp.mat33, k: int) -> wp.vec3:
+    return wp.vec3(m[0, k], m[1, k], m[2, k])
+
+
+@wp.func
+def evaluate(t: Trilinear, p: wp.vec3) -> wp.vec3:
+    low = t.c + p[0] * t.x + p[1] * (t.y + p[0] * t.xy)
+    high = t.z + p[0] * t.xz + p[1] * (t.yz + p[0] * t.xyz)
+    return low + p[2] * high
+
+
+@wp.func
+def path_slope(frame: SolveFrame, s: MapSample, target: wp.vec3) -> wp.mat33:
+    """Derivative of a virtual vertex (eye frame) by its scene point, at a reflection point of a convex map.
+
+    The virtual vertex is L u: L the length of the path, whose derivative is v (Fermat), u the direction from the eye
+    to R, which moves by dR = T H^-1 T^T (I - v v^T) / d_v on the mirror, H the Hessian of the path length.
+    """
+    to_eye = frame.eye - s.p
+    to_target = target - s.p
+    d_o = wp.max(wp.length(to_eye), 1.0e-20)
+    d_v = wp.max(wp.length(to_target), 1.0e-20)
+    o = to_eye / d_o
+    v = to_target / d_v
+    t1, t2 = tangent_basis(s.n)
+    o1 = wp.dot(t1, o)
+    o2 = wp.dot(t2, o)
+    v1 = wp.dot(t1, v)
+    v2 = wp.dot(t2, v)
+    bend = wp.max(wp.dot(s.n, o) + wp.dot(s.n, v), 0.0)
+    # Shape operator from the map's own derivatives, clamped to a convex body's, as in `map_search.newton_step`.
+    a11 = wp.dot(t1, s.p_u)
+    a12 = wp.dot(t1, s.p_v)
+    a21 = wp.dot(t2, s.p_u)
+    a22 = wp.dot(t2, s.p_v)
+    b11 = wp.dot(t1, s.n_u)
+    b12 = wp.dot(t1, s.n_v)
+    b21 = wp.dot(t2, s.n_u)
+    b22 = wp.dot(t2, s.n_v)
+    det_p = a11 * a22 - a12 * a21
+    inv_p = wp.where(wp.abs(det_p) > 1.0e-20, 1.0 / det_p, 0.0)
+    s11 = wp.max((b11 * a22 - b12 * a21) * inv_p, 0.0)
+    s22 = wp.max((b22 * a11 - b21 * a12) * inv_p, 0.0)
+    limit = wp.sqrt(s11 * s22)
+    s12 = wp.clamp(0.5 * ((b12 * a11 - b11 * a12) + (b21 * a22 - b22 * a21)) * inv_p, -limit, limit)
+    h11 = (1.0 - o1 * o1) / d_o + (1.0 - v1 * v1) / d_v + bend * s11
+    h22 = (1.0 - o2 * o2) / d_o + (1.0 - v2 * v2) / d_v + bend * s22
+    h12 = bend * s12 - o1 * o2 / d_o - v1 * v2 / d_v
+    det = wp.max(h11 * h22 - h12 * h12, 1.0e-20)
+    # Rows of T^T (I - v v^T) / d_v, then H^-1.
+    r1 = (t1 - v1 * v) / d_v
+    r2 = (t2 - v2 * v) / d_v
+    m1 = (h22 * r1 - h12 * r2) / det
+    m2 = (h11 * r2 - h12 * r1) / det
+    path = d_o + d_v
+    turn = path / d_o
+    # (I - u u^T) t with u = -o.
+    slope = wp.outer(turn * (t1 - o1 * o), m1) + wp.outer(turn * (t2 - o2 * o), m2) - wp.outer(o, v)
+    return frame.eye_from_unit * slope * frame.unit_from_scene
+
+
+@wp.kernel
+def slope_kernel(
+    first: int,
+    point: wp.array(dtype=wp.vec3),
+    node: VertexView,
+    map: ReflectorMapView,
+    frame: SolveFrame,
+    out_slope: wp.array(dtype=wp.mat33),
+):
+    """One thread per solved node."""
+    i = first + wp.tid()
+    if int(node.status[i]) == CONVERGED:
+        target = frame.unit_from_scene * point[i] + frame.unit_offset
+        out_slope[i] = path_slope(frame, sample_map(map, node.seed[i]), target)
+
+
+@wp.func
+def interpolated_reach(node: VertexView, chunks: ChunkView, cell: int) -> float:
+    """The least of a cell's corners: it decides where triangles are cut, by measure."""
+    reach = float(1.0e30)
+    for k in range(8):
+        reach = wp.min(reach, node.reach[chunks.corner[cell, k]])
+    return reach
+
+
+@wp.func
+def settle(out_vertex: VertexView, vertex: int, camera: CameraView, q: wp.vec3, seed: wp.vec3, reach: float):
+    """Write an interpolated virtual vertex (eye frame)."""
+    out_vertex.status[vertex] = wp.uint8(CONVERGED)
+    out_vertex.reach[vertex] = reach
+    out_vertex.seed[vertex] = project_to_cube(seed)
+    out_vertex.screen[vertex] = project(camera, q)
+    if out_vertex.position.shape[0] > 0:
+        out_vertex.position[vertex] = q
+
+
+@wp.kernel
+def position_kernel(
+    first: int,
     points: wp.array(dtype=wp.vec3),
-    own_first: int,
-    own_count: int,
-    # Reflector:
+    order: wp.array(dtype=int),
+    chunks: ChunkView,
+    node: VertexView,
+    camera: CameraView,
+    out_vertex: VertexView,
+):
+    """One thread per chunk: virtual positions from the cell's corners; seeds too, for whoever searches from here."""
+    i = first + wp.tid()
+    cell = chunks.cell[i]
+    begin = chunks.range[i][0]
+    end = begin + chunks.range[i][1]
+    inv = chunks.inv_edge[cell]
+    if inv == 0.0:
+        for j in range(begin, end):
+            if int(out_vertex.status[order[j]]) == 0:
+                out_vertex.status[order[j]] = wp.uint8(HIDDEN)
+        return
+    low = chunks.low[cell]
+    position = trilinear(node.position, chunks.corner, cell)
+    seed = trilinear(node.seed, chunks.corner, cell)
+    reach = interpolated_reach(node, chunks, cell)
+    for j in range(begin, end):
+        if int(out_vertex.status[order[j]]) == 0:
+            local = (points[j] - low) * inv
+            settle(out_vertex, order[j], camera, evaluate(position, local), evaluate(seed, local), reach)
+
+
+@wp.kernel
+def slope_position_kernel(
+    first: int,
+    points: wp.array(dtype=wp.vec3),
+    order: wp.array(dtype=int),
+    chunks: ChunkView,
+    node: VertexView,
+    slope: wp.array(dtype=wp.mat33),
+    camera: CameraView,
+    out_vertex: VertexView,
+):
+    """One thread per chunk: as `position_kernel`, with the slopes at the corners.
+
+    Each corner predicts position and half the change of its slope: sum w_k (f_k + J_k (x - x_k) / 2). In f's expansion
+    about x the second-order terms of both cancel, so what is left is of third order.
+    """
+    i = first + wp.tid()
+    cell = chunks.cell[i]
+    begin = chunks.range[i][0]
+    end = begin + chunks.range[i][1]
+    inv = chunks.inv_edge[cell]
+    if inv == 0.0:
+        for j in range(begin, end):
+            if int(out_vertex.status[order[j]]) == 0:
+                out_vertex.status[order[j]] = wp.uint8(HIDDEN)
+        return
+    low = chunks.low[cell]
+    half = 0.5 / inv
+    m0 = half * slope[chunks.corner[cell, 0]]
+    m1 = half * slope[chunks.corner[cell, 1]]
+    m2 = half * slope[chunks.corner[cell, 2]]
+    m3 = half * slope[chunks.corner[cell, 3]]
+    m4 = half * slope[chunks.corner[cell, 4]]
+    m5 = half * slope[chunks.corner[cell, 5]]
+    m6 = half * slope[chunks.corner[cell, 6]]
+    m7 = half * slope[chunks.corner[cell, 7]]
+    # f_k - J_k c_k / 2 (c_k the corner in the cell), and the columns of J_k / 2 that the position multiplies.
+    position = trilinear_of(
+        node.position[chunks.corner[cell, 0]],
+        node.position[chunks.corner[cell, 1]] - m1 * wp.vec3(1.0, 0.0, 0.0),
+        node.position[chunks.corner[cell, 2]] - m2 * wp.vec3(0.0, 1.0, 0.0),
+        node.position[chunks.corner[cell, 3]] - m3 * wp.vec3(1.0, 1.0, 0.0),
+        node.position[chunks.corner[cell, 4]] - m4 * wp.vec3(0.0, 0.0, 1.0),
+        node.position[chunks.corner[cell, 5]] - m5 * wp.vec3(1.0, 0.0, 1.0),
+        node.position[chunks.corner[cell, 6]] - m6 * wp.vec3(0.0, 1.0, 1.0),
+        node.position[chunks.corner[cell, 7]] - m7 * wp.vec3(1.0, 1.0, 1.0),
+    )
+    along_x = trilinear_of(
+        column(m0, 0),
+        column(m1, 0),
+        column(m2, 0),
+        column(m3, 0),
+        column(m4, 0),
+        column(m5, 0),
+        column(m6, 0),
+        column(m7, 0),
+    )
+    along_y = trilinear_of(
+        column(m0, 1),
+        column(m1, 1),
+        column(m2, 1),
+        column(m3, 1),
+        column(m4, 1),
+        column(m5, 1),
+        column(m6, 1),
+        column(m7, 1),
+    )
+    along_z = trilinear_of(
+        column(m0, 2),
+        column(m1, 2),
+        column(m2, 2),
+        column(m3, 2),
+        column(m4, 2),
+        column(m5, 2),
+        column(m6, 2),
+        column(m7, 2),
+    )
+    seed = trilinear(node.seed, chunks.corner, cell)
+    reach = interpolated_reach(node, chunks, cell)
+    for j in range(begin, end):
+        if int(out_vertex.status[order[j]]) == 0:
+            local = (points[j] - low) * inv
+            q = evaluate(position, local) + local[0] * evaluate(along_x, local)
+            q += local[1] * evaluate(along_y, local) + local[2] * evaluate(along_z, local)
+            settle(out_vertex, order[j], camera, q, evaluate(seed, local), reach)
+
+
+@wp.kernel
+def direction_kernel(
+    first: int,
+    points: wp.array(dtype=wp.vec3),
+    order: wp.array(dtype=int),
+    chunks: ChunkView,
+    node: VertexView,
     map: ReflectorMapView,
     frame: SolveFrame,
     camera: CameraView,
-    settings: SearchSettings,
-    # Grid:
-    grid_view: GridView,
-    node: VertexView,
-    position_root: float,
-    # Outputs:
+    tolerance: float,
     out_vertex: VertexView,
+    out_failed: wp.array(dtype=wp.uint8),
 ):
-    """One thread per scene vertex: interpolated from its cell's solved corners, or solved where that is unsafe."""
+    """One thread per chunk: one exact step from the direction that the cell's corners give.
+
+    A vertex whose residual after the step moves its picture by more than `tolerance` [radians] is marked.
+    """
     i = first + wp.tid()
-    if i >= own_first and i < own_first + own_count:
+    cell = chunks.cell[i]
+    begin = chunks.range[i][0]
+    end = begin + chunks.range[i][1]
+    inv = chunks.inv_edge[cell]
+    if inv == 0.0:
+        for j in range(begin, end):
+            if int(out_vertex.status[order[j]]) == 0:
+                out_vertex.status[order[j]] = wp.uint8(HIDDEN)
         return
-    target = frame.unit_from_scene * points[i] + frame.unit_offset
-    cell = int(-1)
-    if i < grid_view.vertex_cell.shape[0]:  # beyond: vertices of cut triangles
-        cell = grid_view.vertex_cell[i]
-    x = wp.vec3(0.0, 0.0, 0.0)
-    position = wp.vec3(0.0, 0.0, 0.0)
-    solved = int(0)
-    hidden = int(0)
-    shortest = float(1.0e30)
-    if cell >= 0:
-        local = grid_view.vertex_local[i]
-        for k in range(8):
-            corner = grid_view.cell_nodes[cell, k]
-            status = int(node.status[corner])
-            if status == CONVERGED:
-                solved += 1
-                weight = corner_weight(local, k)
-                seed = node.seed[corner]
-                x += weight * seed
-                if position_root > 0.0:
-                    position += weight * node.position[corner]
-                    shortest = wp.min(shortest, node.reach[corner])
-            elif status == HIDDEN:
-                hidden += 1
-    if hidden == 8:
-        # What lies behind a convex body is convex: so does the whole cell.
-        out_vertex.status[i] = wp.uint8(HIDDEN)
-        out_vertex.screen[i] = wp.vec4(0.0, 0.0, -1.0, 0.0)
-        return
-    if solved == 8:
-        first_corner = grid_view.nodes[grid_view.cell_nodes[cell, 0]]
-        last_corner = grid_view.nodes[grid_view.cell_nodes[cell, 7]]
-        diagonal = wp.length(frame.unit_from_scene * (last_corner - first_corner))
-        if position_root > 0.0 and diagonal < SPACE_DIAGONAL * shortest * position_root:
-            out_vertex.status[i] = wp.uint8(CONVERGED)
-            out_vertex.screen[i] = project(camera, position)
-            return
-        x = project_to_cube(x)
-        sample = sample_map(map, x)
-        r = measure(sample, x, frame.eye, target)
-        if position_root == 0.0 and r.residual < RESIDUAL_MAX:
-            x = step_on_cube(map, r, newton_step(sample, frame.eye, target), 1.0)
-            # Read again: a tangent step leaves the body by its sagitta, which coarse cells make visible.
+    low = chunks.low[cell]
+    seed = trilinear(node.seed, chunks.corner, cell)
+    for j in range(begin, end):
+        vertex = order[j]
+        if int(out_vertex.status[vertex]) == 0:
+            x = project_to_cube(evaluate(seed, (points[j] - low) * inv))
+            target = frame.unit_from_scene * points[j] + frame.unit_offset
             sample = sample_map(map, x)
             r = measure(sample, x, frame.eye, target)
-            if r.residual < ACCEPTED:
-                out_vertex.seed[i] = x
-                out_vertex.residual[i] = r.residual
-                out_vertex.status[i] = wp.uint8(CONVERGED)
-                out_vertex.reach[i] = edge_reach(frame, r.p, r.n, target, map.least_curvature)
-                out_vertex.screen[i] = project(camera, virtual_vertex(frame, r.p, r.n, target))
-                return
-    solve_vertex(map, frame, camera, settings, target, wp.vec3(0.0, 0.0, 0.0), i, out_vertex)
+            out_failed[j] = wp.uint8(1)
+            out_vertex.seed[vertex] = x
+            if r.residual < RESIDUAL_MAX:
+                x = step_on_cube(map, r, newton_step(sample, frame.eye, target), 1.0)
+                # Read again: a tangent step leaves the body by its sagitta, which coarse cells make visible.
+                sample = sample_map(map, x)
+                r = measure(sample, x, frame.eye, target)
+                reach = edge_reach(frame, r.p, r.n, target, map.least_curvature)
+                # residual 2 c / lambda is the way left on the mirror; 1 / d_o makes it an angle.
+                share = wp.length(target - r.p) / wp.max(reach, 1.0e-20)
+                left = r.residual * (r.cos_eye + r.cos_target) * ESTIMATE * share * share
+                if r.residual < ACCEPTED and left < tolerance:
+                    out_failed[j] = wp.uint8(0)
+                    out_vertex.residual[vertex] = r.residual
+                    settle(out_vertex, vertex, camera, virtual_vertex(frame, r.p, r.n, target), x, reach)
 
 
-def build(scene: Scene, own: PartRange, share: float) -> Grid:
-    """A grid over every instance but the mirror's own.
-
-    Args:
-        own: The mirror.
-        share: Grid nodes as a fraction of the vertices, the paper's percentage.
-    """
-    vertex_cell = np.full(scene.vertex_count, -1, np.int32)
-    vertex_local = np.zeros((scene.vertex_count, 3), np.float32)
-    nodes, cells = [], []
-    node_count = cell_count = gridded = 0
-    seen = set()
-    for part in scene.parts:
-        if part.first_vertex in seen or part.first_vertex == own.first_vertex:
-            continue
-        seen.add(part.first_vertex)
-        members = slice(part.first_vertex, part.first_vertex + part.vertex_count)
-        fitted = _fit(scene.host_points[members].astype(np.float64), share)
-        if fitted is None:
-            continue
-        points, corners, cell, local = fitted
-        nodes.append(points)
-        cells.append(corners + node_count)
-        vertex_cell[members] = cell + cell_count
-        vertex_local[members] = local
-        node_count += len(points)
-        cell_count += len(corners)
-        gridded += part.vertex_count
-    view = GridView()
-    stacked = np.concatenate(nodes) if nodes else np.zeros((0, 3))
-    view.nodes = wp.array(stacked.astype(np.float32), dtype=wp.vec3, device=scene.device)
-    table = np.concatenate(cells) if cells else np.zeros((0, CORNER_COUNT))
-    view.cell_nodes = wp.array(table.astype(np.int32), dtype=int, device=scene.device, ndim=2)
-    view.vertex_cell = wp.array(vertex_cell, dtype=int, device=scene.device)
-    view.vertex_local = wp.array(vertex_local, dtype=wp.vec3, device=scene.device)
-    return Grid(view, node_count, node_count / max(gridded, 1))
+@wp.kernel
+def gather_kernel(
+    first: int,
+    points: wp.array(dtype=wp.vec3),
+    order: wp.array(dtype=int),
+    place: wp.array(dtype=int),
+    vertex: VertexView,
+    out_point: wp.array(dtype=wp.vec3),
+    out_vertex: VertexView,
+):
+    """One thread per listed vertex of the grid: where it is and what its search starts from."""
+    i = first + wp.tid()
+    j = place[i]
+    out_point[i] = points[j]
+    out_vertex.seed[i] = vertex.seed[order[j]]
 
 
-def _fit(points: np.ndarray, share: float):
-    """(nodes, cell corners, vertex cell, vertex local) with about `share` nodes per vertex; None if direct is cheaper."""
-    wanted = share * len(points)
-    if wanted < CORNER_COUNT:
+@wp.kernel
+def scatter_kernel(
+    first: int,
+    order: wp.array(dtype=int),
+    place: wp.array(dtype=int),
+    solved: VertexView,
+    out_vertex: VertexView,
+):
+    """One thread per listed vertex of the grid: its own solution into the scene's vertices."""
+    i = first + wp.tid()
+    vertex = order[place[i]]
+    out_vertex.screen[vertex] = solved.screen[i]
+    out_vertex.status[vertex] = solved.status[i]
+    out_vertex.seed[vertex] = solved.seed[i]
+    out_vertex.residual[vertex] = solved.residual[i]
+    out_vertex.reach[vertex] = solved.reach[i]
+    if out_vertex.position.shape[0] > 0:
+        out_vertex.position[vertex] = solved.position[i]
+
+
+def build(scene: Scene, own: PartRange) -> Grid | None:
+    """The octree over everything but the mirror's own vertices; None where there is nothing to reflect."""
+    members = np.ones(scene.vertex_count, bool)
+    if own.is_whole:
+        members[own.first_vertex : own.first_vertex + own.vertex_count] = False
+    vertices = np.flatnonzero(members).astype(np.int32)
+    if not len(vertices):
         return None
-    low = points.min(axis=0)
-    span = points.max(axis=0) - low
-    longest = float(span.max())
-    if longest == 0.0:
-        return None
-    coarse, fine = 1.0, FIT_SPAN
-    best = None
-    for _ in range(FIT_STEPS):
-        middle = float(np.sqrt(coarse * fine))
-        layout = _layout(points, low, span, longest / middle)
-        if layout[1] <= wanted:
-            best, coarse = layout, middle
-        else:
-            fine = middle
-    if best is None:
-        return None
-    return _cells(points, low, *best[:1])
+    tree = octree.build(scene.host_points[vertices])
+    vertices = vertices[tree.order]
+    level = 0
+    allowed = max(START_SHARE * len(vertices), CORNER_COUNT)
+    while level + 1 < tree.level_count:
+        finer = tree.cells_of(level + 1)
+        if len(np.unique(tree.corners[finer])) > allowed:
+            break
+        level += 1
+    return Grid(
+        tree,
+        vertices,
+        wp.array(vertices, dtype=int, device=scene.device),
+        wp.array(scene.host_points[vertices], dtype=wp.vec3, device=scene.device),
+        tree.cells_of(level),
+    )
 
 
-def _layout(points, low, span, cell) -> tuple[np.ndarray, int]:
-    """(cell size per axis, nodes of the occupied cells) for nearly cubic cells of about the given size."""
-    counts = np.clip(np.round(span / cell), 1, CELL_LIMIT)
-    # A flat mesh has no extent along an axis: any positive size makes it one cell thick.
-    size = np.where(span > 0.0, span / counts, cell)
-    index, counts = _cell_index(points, low, span, size)
-    occupied = np.unique(_flatten(index, counts))
-    return size, len(np.unique(_corner_numbers(occupied, counts)))
-
-
-def _cell_index(points, low, span, size) -> tuple[np.ndarray, np.ndarray]:
-    counts = np.maximum(np.round(span / size), 1).astype(np.int64)
-    return np.clip(((points - low) / size).astype(np.int64), 0, counts - 1), counts
-
-
-def _flatten(index, counts) -> np.ndarray:
-    return (index[:, 2] * counts[1] + index[:, 1]) * counts[0] + index[:, 0]
-
-
-def _corner_numbers(cells, counts) -> np.ndarray:
-    """Lattice numbers of the corners of flat cells, [cell_count, 8]."""
-    x, y, z = cells % counts[0], cells // counts[0] % counts[1], cells // (counts[0] * counts[1])
-    corner = np.arange(CORNER_COUNT)
-    cx = x[:, None] + (corner & 1)
-    cy = y[:, None] + (corner >> 1 & 1)
-    cz = z[:, None] + (corner >> 2 & 1)
-    return (cz * (counts[1] + 1) + cy) * (counts[0] + 1) + cx
-
-
-def _cells(points, low, size):
-    span = points.max(axis=0) - low
-    index, counts = _cell_index(points, low, span, size)
-    occupied, cell = np.unique(_flatten(index, counts), return_inverse=True)
-    numbers, corners = np.unique(_corner_numbers(occupied, counts), return_inverse=True)
-    wide = counts + 1
-    lattice = np.stack([numbers % wide[0], numbers // wide[0] % wide[1], numbers // (wide[0] * wide[1])], 1)
-    local = np.clip((points - low) / size - index, 0.0, 1.0)
-    return low + lattice * size, corners.reshape(-1, CORNER_COUNT), cell.reshape(-1), local
-
-
-def interpolate(
+def fill(
     scene: Scene,
     cells: Grid,
-    node: VertexView,
-    points: wp.array,
-    own: list[int],
-    map: ReflectorMap,
+    solve: Callable,
     frame: SolveFrame,
+    map: ReflectorMap,
     view: CameraView,
-    search: SearchSettings,
     camera: Camera,
+    box: tuple[int, int, int, int],
     settings: Settings,
     out_vertex: VertexView,
-) -> None:
-    """Fill the vertices of a scene from the solved nodes of a grid.
+) -> dict[str, int]:
+    """Fill the vertices of a scene from a grid, solving as few as `max_error_px` or `grid_share` allow.
 
     Args:
-        node: Solved nodes of `cells`, with positions where `settings.grid_kind` is "position".
-        points: vec3 [n], scene frame; the scene's own vertices come first.
-        own: [first, count] of the mirror's own vertices, see `forward.own_vertices`.
-        map: The reflector, for the exact step and for vertices that are solved after all.
+        solve: (points, out VertexView) -> None: the exact solution of every point, from `out.seed` where not zero.
+        map: The reflector.
         camera: What `view` was made from.
-        out_vertex: One entry per point.
+        box: Of the mirror's pixels.
+        out_vertex: One entry per scene vertex, empty.
+
+    Returns:
+        Statistics: `grid_vertices` of which `grid_nodes` and `grid_exact` solves were made, `grid_levels` used.
     """
-    positions = settings.grid_kind == "position"
-    root = float(np.sqrt(POSITION_PX / max(camera.fx, camera.fy))) if positions else 0.0
-    inputs = [points, *own, map.view, frame, view, search, cells.view, node, root, out_vertex]
-    launch(interpolate_kernel, len(points), inputs, scene.device, settings.threads)
+    descent = _Descent(scene, cells, solve, frame, map, camera, box, settings, out_vertex)
+    interpolated, exact = descent.run()
+    tree = cells.tree
+    failed = _interpolate(scene, cells, descent, interpolated, map, frame, view, camera, settings, out_vertex)
+    places = np.concatenate([_ranges(tree.first[exact], tree.count[exact]), failed]).astype(np.int32)
+    places = places[np.diff(descent.waiting_before)[places] > 0]
+    if len(places):
+        listed = wp.array(places, dtype=int, device=scene.device)
+        points = wp.empty(len(places), dtype=wp.vec3, device=scene.device)
+        solved = empty_vertices(len(places), scene.device, with_position=len(out_vertex.position) > 0)
+        inputs = [cells.points, cells.order, listed, out_vertex, points, solved]
+        launch(gather_kernel, len(places), inputs, scene.device, settings.threads)
+        solve(points, solved)
+        launch(scatter_kernel, len(places), [cells.order, listed, solved, out_vertex], scene.device, settings.threads)
+    levels = np.unique(tree.level[interpolated])
+    return {
+        "grid_vertices": int(descent.waiting_before[-1]),
+        "grid_nodes": descent.node_count,
+        "grid_exact": len(places),
+        "grid_levels": len(levels),
+    }
+
+
+class _Descent:
+    """Which cells a view interpolates from, with their nodes solved."""
+
+    def __init__(self, scene, cells, solve, frame, map, camera, box, settings, out_vertex):
+        self.scene, self.cells, self.solve, self.frame, self.settings = scene, cells, solve, frame, settings
+        tree = cells.tree
+        waiting = out_vertex.status.numpy()[cells.vertices] == 0
+        self.waiting_before = np.r_[0, np.cumsum(waiting)]
+        self.slot = np.full(len(tree.nodes), -1, np.int32)
+        self.node_count = 0
+        # More nodes than this are not solved: the rest is exact.
+        self.capacity = min(len(tree.nodes), int(NODES_MAX * len(cells.vertices)) + len(cells.start) * CORNER_COUNT)
+        self.node = empty_vertices(self.capacity, scene.device, with_position=True)
+        self.slope = wp.empty(
+            self.capacity if settings.grid_kind == "slope" else 0, dtype=wp.mat33, device=scene.device
+        )
+        self.map = map
+        self.point = wp.empty(self.capacity, dtype=wp.vec3, device=scene.device)
+        linear = np.array(frame.unit_from_scene, np.float64).reshape(3, 3)
+        self.unit_per_scene = float(np.cbrt(abs(np.linalg.det(linear))))
+        self.test = CellTest()
+        self.test.pixels_per_radian = max(camera.fx, camera.fy)
+        self.test.unit_per_scene = self.unit_per_scene
+        self.test.order = ORDERS[settings.grid_kind]
+        self.test.extent = wp.vec3(*map.extent)
+        self.test.body_width = 2.0 * float(min(map.extent))
+        self.test.body_radius = float(map.outer_radius * max(map.extent))
+        self.test.box = wp.vec4(*(float(side) for side in box))
+
+    def waiting(self, cell) -> np.ndarray:
+        """Vertices of cells that have no answer yet."""
+        first = self.cells.tree.first[cell]
+        return self.waiting_before[first + self.cells.tree.count[cell]] - self.waiting_before[first]
+
+    def run(self) -> tuple[np.ndarray, np.ndarray]:
+        """(cells to interpolate from or hidden, cells whose vertices are solved one by one)."""
+        by_error = self.settings.max_error_px > 0.0
+        asked = self.settings.max_error_px
+        if self.settings.grid_kind == "direction":
+            asked = min(asked, DIRECTION_PX)
+        done, exact = [], []
+        cell = self.cells.start[self.waiting(self.cells.start) > 0]
+        error = self._estimate(cell)
+        for step in range(ROUNDS_MAX if by_error else BUDGET_ROUNDS + 1):
+            unsafe = error >= UNSAFE
+            last = not by_error and step == BUDGET_ROUNDS
+            tolerance = asked if by_error else self._tolerance(cell, error)
+            depth = self._depth(cell, error, tolerance)
+            wrong = error > tolerance
+            split = wrong & (depth > 0)
+            if last or self.waiting(cell[split]).sum() < ROUND_WORTH:
+                split[:] = False
+            direct = (wrong if by_error else unsafe) & ~split
+            exact.append(cell[direct])
+            done.append(cell[~split & ~direct])
+            if not split.any():
+                break
+            cell = self._below(cell[split], depth[split])
+            cell = cell[self.waiting(cell) > 0]
+            error = self._estimate(cell)
+        return np.concatenate(done), np.concatenate(exact)
+
+    def _depth(self, cell, error, tolerance) -> np.ndarray:
+        """Levels to go down from cells until their error falls to the tolerance; 0 where solving the vertices is cheaper."""
+        tree = self.cells.tree
+        count = self.waiting(cell)
+        # A boundary halves the vertices in doubt with every level; a surface has 4 children a cell.
+        depth = np.floor(0.5 * np.log2(np.maximum(count / STRADDLING_COUNT, 1.0)))
+        depth[error >= NEAR] = np.minimum(depth[error >= NEAR], 1.0)
+        known = error < UNSAFE
+        levels = np.ceil(np.log2(np.maximum(error[known] / tolerance, 1.0)) / self.test.order)
+        depth[known] = np.where(count[known] > NODES_PER_CELL * 4.0**levels, levels, 0.0)
+        return np.where(tree.child_count[cell] > 0, depth, 0.0).astype(np.int64)
+
+    def _tolerance(self, cell, error) -> float:
+        """The error that the solves left by `grid_share` reach, by the estimates so far, in pixels."""
+        tree = self.cells.tree
+        rest = self.settings.grid_share * len(self.cells.vertices) - self.node_count
+        unsafe = error >= UNSAFE
+        rest -= NODES_PER_CELL * float((self.waiting(cell[unsafe]) / STRADDLING_COUNT).sum())
+        known = ~unsafe & (error > 0.0) & (tree.child_count[cell] > 0)
+        if not known.any():
+            return 1.0
+        error, count = error[known], self.waiting(cell[known])
+        low, high = 0.0, float(np.log2(error.max() / TOLERANCE_LEAST + 1.0))
+        for _ in range(FIT_STEPS):
+            middle = 0.5 * (low + high)
+            levels = np.ceil(np.log2(np.maximum(error / (TOLERANCE_LEAST * 2.0**middle), 1.0)) / self.test.order)
+            leaves = 4.0**levels
+            price = np.where(levels > 0, np.minimum(NODES_PER_CELL * leaves, count), 0.0).sum()
+            if price <= rest:
+                high = middle
+            else:
+                low = middle
+        return TOLERANCE_LEAST * 2.0**high
+
+    def _below(self, cell, depth) -> np.ndarray:
+        """The cells so many levels below, or where the tree ends."""
+        tree = self.cells.tree
+        result = []
+        current = cell
+        while len(current):
+            number = tree.child_count[current]
+            child = _ranges(tree.child_first[current], number)
+            depth = np.repeat(depth, number) - 1
+            end = (depth == 0) | (tree.child_count[child] == 0)
+            result.append(child[end])
+            current, depth = child[~end], depth[~end]
+        return np.concatenate(result)
+
+    def _estimate(self, cell) -> np.ndarray:
+        """Errors of cells [pixels]; their corners are solved."""
+        tree = self.cells.tree
+        device, threads = self.scene.device, self.settings.threads
+        self._solve_corners(cell)
+        corner = self.slot[tree.corners[cell]]
+        room = (corner >= 0).all(axis=1)
+        edge = (tree.edge(cell) * self.unit_per_scene).astype(np.float32)
+        error = wp.empty(len(cell), dtype=float, device=device)
+        inputs = [wp.array(np.maximum(corner, 0), dtype=int, device=device), wp.array(edge, dtype=float, device=device)]
+        launch(
+            estimate_kernel,
+            len(cell),
+            [*inputs, self.point, self.node, self.slope, self.frame, self.test, error],
+            device,
+            threads,
+        )
+        return np.where(room, error.numpy(), UNSAFE)
+
+    def _solve_corners(self, cell) -> None:
+        tree = self.cells.tree
+        device, threads = self.scene.device, self.settings.threads
+        asked = np.zeros(len(tree.nodes), bool)
+        asked[tree.corners[cell]] = True
+        new = np.flatnonzero(asked & (self.slot < 0))[: self.capacity - self.node_count]
+        if not len(new):
+            return
+        first, end = self.node_count, self.node_count + len(new)
+        part = vertices_from(self.node, first)
+        point = self.point[first:end]
+        point.assign((tree.low + tree.nodes[new] * tree.unit).astype(np.float32))
+        self.solve(point, part)
+        if len(self.slope):
+            inputs = [point, part, self.map.view, self.frame, self.slope[first:]]
+            launch(slope_kernel, len(new), inputs, device, threads)
+        self.slot[new] = np.arange(first, end, dtype=np.int32)
+        self.node_count = end
+
+
+def _interpolate(scene, cells, descent, cell, map, frame, view, camera, settings, out_vertex) -> np.ndarray:
+    """Interpolate the vertices of cells; returns the places (in the grid's order) of those that must be solved."""
+    tree, device = cells.tree, scene.device
+    if not len(cell):
+        return np.zeros(0, np.int32)
+    slots = descent.slot[tree.corners[cell]]
+    hidden = (descent.node.status.numpy()[slots] == int(HIDDEN)).all(axis=1)
+    edge = tree.edge(cell)
+    pieces = -(-tree.count[cell] // CHUNK)
+    owner = np.repeat(np.arange(len(cell)), pieces)
+    step = (np.arange(len(owner)) - np.repeat(np.cumsum(pieces) - pieces, pieces)) * CHUNK
+    begin = tree.first[cell][owner] + step
+    chunks = ChunkView()
+    ranges = np.stack([begin, np.minimum(tree.count[cell][owner] - step, CHUNK)], axis=1)
+    chunks.range = wp.array(ranges.astype(np.int32), dtype=wp.vec2i, device=device)
+    chunks.cell = wp.array(owner.astype(np.int32), dtype=int, device=device)
+    chunks.corner = wp.array(slots, dtype=int, device=device)
+    low = tree.low + tree.place[cell] * tree.unit
+    chunks.low = wp.array(low.astype(np.float32), dtype=wp.vec3, device=device)
+    chunks.inv_edge = wp.array(np.where(hidden, 0.0, 1.0 / edge).astype(np.float32), dtype=float, device=device)
+    inputs = [cells.points, cells.order, chunks, descent.node]
+    # A chunk is worth many elements of an ordinary launch.
+    split_min = CHUNK
+    if settings.grid_kind == "slope":
+        inputs += [descent.slope, view, out_vertex]
+        launch(slope_position_kernel, len(owner), inputs, device, settings.threads, split_min=split_min)
+        return np.zeros(0, np.int32)
+    if settings.grid_kind == "position":
+        launch(position_kernel, len(owner), [*inputs, view, out_vertex], device, settings.threads, split_min=split_min)
+        return np.zeros(0, np.int32)
+    tolerance = settings.max_error_px / max(camera.fx, camera.fy) if settings.max_error_px > 0.0 else 1.0
+    failed = wp.zeros(len(cells.vertices), dtype=wp.uint8, device=device)
+    inputs += [map.view, frame, view, tolerance, out_vertex, failed]
+    launch(direction_kernel, len(owner), inputs, device, settings.threads, split_min=split_min)
+    return np.flatnonzero(failed.numpy()).astype(np.int32)
+
+
+def _ranges(first: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """The numbers of consecutive ranges, one after the other."""
+    ends = np.cumsum(count)
+    total = int(ends[-1]) if len(ends) else 0
+    return np.arange(total) + np.repeat(first - ends + count, count)

@@ -23,7 +23,7 @@ from warp_reflect.scene import PartRange, Scene
 from warp_reflect.settings import Settings, Technique
 from warp_reflect.techniques import baking, forward, grid
 from warp_reflect.techniques.map_search import SearchSettings, is_visible, search_settings, solve_vertex
-from warp_reflect.techniques.vertices import SolveFrame, VertexView, empty_vertices
+from warp_reflect.techniques.vertices import SolveFrame, VertexView, vertices_from
 
 wp.set_module_options({"enable_backward": False})
 
@@ -158,7 +158,8 @@ def prepare(scene: Scene, reflector: Reflector, settings: Settings) -> Prepared:
         device=scene.device,
     )
     drawn = baking.baked_or_drawn(scene, part, faces, resolution, draw)
-    cells = grid.build(scene, part, settings.grid_share) if settings.grid_share > 0.0 else None
+    gridded = settings.grid_share > 0.0 or settings.max_error_px > 0.0
+    cells = grid.build(scene, part) if gridded else None
     return Prepared(reflector, drawn, drawn.unit_from_body, cells)
 
 
@@ -226,6 +227,7 @@ def reflect(
     """Search every vertex, draw the virtual meshes, refine: see `forward.reflect`."""
     part = scene.parts[prepared.reflector.part]
     chosen = search_settings(settings, prepared.map.resolution)
+    statistics = {}
 
     def search(points, own: list[int], frame: SolveFrame, warm: bool, out_vertex: VertexView) -> None:
         inputs = [points, *own, prepared.map.view, frame, gbuffer.view, chosen, int(warm), out_vertex]
@@ -236,23 +238,24 @@ def reflect(
         if prepared.grid is None or not has_own:
             search(points, own, frame, warm, out_vertex)
             return
-        positions = settings.grid_kind == "position"
-        node = empty_vertices(prepared.grid.node_count, scene.device, with_position=positions)
-        search(prepared.grid.view.nodes, [0, 0], frame, False, node)
-        grid.interpolate(
-            scene,
-            prepared.grid,
-            node,
-            points,
-            own,
-            prepared.map,
-            frame,
-            gbuffer.view,
-            chosen,
-            camera,
-            settings,
-            out_vertex,
+        statistics.update(
+            grid.fill(
+                scene,
+                prepared.grid,
+                lambda asked, out: search(asked, [0, 0], frame, True, out),
+                frame,
+                prepared.map,
+                gbuffer.view,
+                camera,
+                pixels.box,
+                settings,
+                out_vertex,
+            )
         )
+        if len(points) > scene.vertex_count:
+            # Vertices of triangles that the previous frame cut.
+            added = vertices_from(out_vertex, scene.vertex_count)
+            search(points[scene.vertex_count :], [0, 0], frame, warm, added)
 
     def solve_boundary(points, frame: SolveFrame, edges: wp.array, out_point: wp.array) -> None:
         launch(
@@ -263,7 +266,7 @@ def reflect(
             settings.threads,
         )
 
-    return forward.reflect(
+    layer = forward.reflect(
         scene,
         prepared.reflector,
         Technique.REFLECTOR_MAP,
@@ -277,3 +280,5 @@ def reflect(
         history,
         prepared.map.view.greatest_curvature,
     )
+    layer.statistics.update(statistics)
+    return layer
