@@ -136,13 +136,13 @@ def _solid_angle(corner: np.ndarray) -> float:
 class Sheet:
     """An open mesh as a part of the surface of a convex body, its *companion*.
 
-    The companion is what lies behind the tangent planes of the sheet's rim and in a box: it continues the sheet without an
-    edge and closes far from it.
+    The companion is what lies behind the tangent planes of the sheet's rim and in a superellipsoid around it: it continues
+    the sheet without an edge and closes far from it.
 
     Attributes:
         centre: A point of the companion that sees the whole sheet from behind, float64 [3].
-        axes: Rows are the box's axes, right-handed, float64 [3, 3].
-        extent: The box's half extents along the axes about the centre, float64 [3].
+        axes: Rows are the superellipsoid's axes, right-handed, float64 [3, 3].
+        extent: Its half extents along the axes about the centre, float64 [3].
         cosine: Least cosine between a facet's normal and the ray from the centre to it: above 0 the sheet is star-shaped.
         overhang: Of the sheet's size: by how much a corner stands out over the plane of a facet; 0 if truly convex.
         inner: The body lies before the sheet's winding side: it is concave seen from its front.
@@ -163,8 +163,9 @@ class Sheet:
 SHEET_SAMPLES = 384  # planes and corners that stand for a sheet's where each meets each
 DEPTHS = 25  # places tried for the centre
 DEPTH_MAX = 0.6  # of the sheet's size, behind its middle: deeper, the sheet fills too little of its map
-BOX_MARGIN = 0.3  # of the half extents: the companion's sides stay clear of the sheet
-EXTENT_MIN = 0.05  # of the largest half extent: a flat sheet's companion is a slab
+EXTENT_MIN = 0.25  # of the largest half extent: a flat sheet's companion is no blade
+CLOSING_POWER = 4.0  # of the superellipsoid (|x| / extent)^4 + ... = 1 that closes a companion: round, but roomy
+CLOSING_GAUGE = 0.65  # of the superellipsoid: the sheet stays inside by so much
 
 
 def fit_sheet(corner: np.ndarray, inner: bool) -> Sheet:
@@ -197,8 +198,10 @@ def fit_sheet(corner: np.ndarray, inner: bool) -> Sheet:
     towards = local.mean(axis=1) - centre
     exact = np.einsum("ij,ij->i", towards, unit) / np.maximum(np.linalg.norm(towards, axis=1), 1.0e-12)
     above = overhang(local[_spread(len(local), SHEET_SAMPLES)], inner, local)
-    extent = np.abs((local.reshape(-1, 3) - centre) @ axes.T).max(axis=0)
-    extent = np.maximum(extent, EXTENT_MIN * extent.max()) * (1.0 + BOX_MARGIN)
+    along = np.abs((local.reshape(-1, 3) - centre) @ axes.T)
+    extent = along.max(axis=0)
+    extent = np.maximum(extent, EXTENT_MIN * extent.max())
+    extent *= float((((along / extent) ** CLOSING_POWER).sum(axis=1) ** (1.0 / CLOSING_POWER)).max()) / CLOSING_GAUGE
     result = Sheet(centre, axes, extent, float(exact.min()), float(above.max()), inner)
     return result.placed(size, 0.5 * (low + high))
 

@@ -14,18 +14,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from warp_reflect.bodies import Sheet, fit_sheet, overhang, weld
-from warp_reflect.scene import edge_neighbours
+from warp_reflect.scene import PartRange, Scene, edge_neighbours
 
 EDGE_SINE_MAX = 0.3  # 17 degrees; facets of a coarse but smooth body stay below, the rim of a cylinder is far above
 CREASE_COS = 0.85  # 32 degrees: facets that turn by more do not share a vertex normal
 # Curvature times the mesh's size below which a triangle counts as flat: a radius of 50 sizes.
 FLAT_CURVATURE = 0.02
-SIGN_SHARE = 0.08  # of the larger curvature: a smaller one of the other sign is the tessellation's noise
+# Likewise: a fillet of a smaller radius turns within three texels of a map with 128 nodes, which cannot hold it.
+CURVATURE_MAX = 40.0
+SIGN_SHARE = 0.04  # of the larger curvature: a smaller one of the other sign is the tessellation's noise
 SMOOTH_STEPS = 2  # times that curvatures are averaged with the neighbours'
 SLIVER_SHARE = 0.003  # of the mesh's area: a smaller region is noise of its neighbour, or left out
 SLIVER_ROUNDS = 3
 PIECE_SHARE = 0.004  # of the mesh's area: a smaller sheet is not worth a pass over the scene's vertices
-PIECES_MAX = 12
+PIECES_MAX = 16
 SPLIT_DEPTH = 5
 NORMAL_WEIGHT = 0.7  # of a unit normal against a position in sizes, where a region is split in two
 COSINE_MIN = (
@@ -33,7 +35,7 @@ COSINE_MIN = (
 )
 # Of a sheet's size: a corner may stand out over other facets by so much. Candidates are wrong by about as much there, which
 # refinement forgives.
-OVERHANG_MAX = 0.01
+OVERHANG_MAX = 2.0e-3
 TRIM_SHARE = 0.5  # of a region's area that must be left when its overhung triangles are cut off; else it is halved
 FLATNESS_MAX = 1.0e-6  # of a sheet's size: off its plane by less it is a plane
 
@@ -83,6 +85,21 @@ class Segmentation:
             if self.saddle > 0.0005:
                 text += f" ({100 * self.saddle:.1f} % curves both ways)"
         return text
+
+
+def part_mesh(scene: Scene, part: PartRange) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """(points, triangles, corner normals or None) of a part, scene frame; flat facets get no normals."""
+    triangles = slice(part.first_triangle, part.first_triangle + part.triangle_count)
+    points = scene.host_points[part.first_vertex : part.first_vertex + part.vertex_count]
+    faces = scene.host_triangles[triangles] - part.first_vertex
+    index = scene.host_normal_index[triangles]
+    corner = points[faces].astype(np.float64)
+    facet = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    facet /= np.maximum(np.linalg.norm(facet, axis=1, keepdims=True), 1.0e-300)
+    normals = np.repeat(facet[:, None], 3, axis=1)
+    smooth = index[:, 0] >= 0
+    normals[smooth] = scene.host_normals[index[smooth]]
+    return points, faces, normals
 
 
 def segment(points: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> Segmentation:
@@ -221,6 +238,7 @@ def _label(low, high) -> np.ndarray:
     label[low >= -slack] = CONVEX
     label[(high <= slack) & (low < -slack)] = CONCAVE
     label[largest <= FLAT_CURVATURE] = FLAT
+    label[largest > CURVATURE_MAX] = SADDLE
     return label
 
 

@@ -15,7 +15,7 @@ import warp as wp
 
 from warp_reflect.cubemap import project_to_cube
 from warp_reflect.layers import CameraView, project
-from warp_reflect.reflector_maps import MapSample, ReflectorMapView, sample_map
+from warp_reflect.reflector_maps import MapSample, ReflectorMapView, nearest_texel, sample_map
 from warp_reflect.settings import Settings, Status
 from warp_reflect.shapes import max_abs
 from warp_reflect.techniques.vertices import SolveFrame, VertexView, edge_reach, virtual_vertex
@@ -44,6 +44,7 @@ SEARCH_MIDPOINT = wp.constant(1)
 CONVERGED = wp.constant(int(Status.CONVERGED))
 HIDDEN = wp.constant(int(Status.HIDDEN))
 MAX_ITERATIONS = wp.constant(int(Status.MAX_ITERATIONS))
+UNREFLECTED = wp.constant(int(Status.UNREFLECTED))
 
 
 @wp.struct
@@ -392,13 +393,21 @@ def solve_vertex(
     r = search(map, frame.eye, target, seed, settings)
     out_vertex.seed[i] = r.x
     out_vertex.residual[i] = r.residual
+    status = CONVERGED
     if r.residual > ACCEPTED:
-        # So close behind the silhouette that the bilinear body and the gauge disagree: as good as hidden, and the
-        # boundary's bisection ends at the vertex itself, where virtual and real point coincide.
-        grazing = wp.min(r.cos_eye, r.cos_target) < GRAZING_COS
-        out_vertex.status[i] = wp.uint8(wp.where(grazing, HIDDEN, MAX_ITERATIONS))
-        return
-    out_vertex.status[i] = wp.uint8(CONVERGED)
+        # On the part that closes an open reflector nothing is seen: any picture near the right one will do.
+        closing = map.texels[nearest_texel(map, r.x)][3] < 0.5
+        if r.residual > map.accepted:
+            # So close behind the silhouette that the bilinear body and the gauge disagree: as good as hidden, and the
+            # boundary's bisection ends at the vertex itself, where virtual and real point coincide.
+            grazing = wp.min(r.cos_eye, r.cos_target) < GRAZING_COS
+            status = wp.where(grazing, HIDDEN, wp.where(closing, UNREFLECTED, MAX_ITERATIONS))
+            out_vertex.status[i] = wp.uint8(status)
+            return
+        # A crease sharper than the texels: drawn near its place, refinement walks from there, but nothing beside it is
+        # trusted to be sky.
+        status = wp.where(closing, CONVERGED, MAX_ITERATIONS)
+    out_vertex.status[i] = wp.uint8(status)
     out_vertex.reach[i] = edge_reach(frame, r.p, r.n, target, map.least_curvature)
     q = virtual_vertex(frame, r.p, r.n, target)
     out_vertex.screen[i] = project(camera, q)

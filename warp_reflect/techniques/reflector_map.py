@@ -9,7 +9,8 @@ Objects" (2005), section 4.1 (maps); the search itself is `map_search.py`. What 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import sys
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -20,14 +21,16 @@ from warp_reflect.launch import launch
 from warp_reflect.layers import Camera, CameraView, GBuffer, MirrorPixels, ReflectionLayer, Reflector
 from warp_reflect.reflector_maps import ReflectorMap, ReflectorMapView
 from warp_reflect.scene import PartRange, Scene
+from warp_reflect.segments import EDGE_SINE_MAX, Segmentation, part_mesh, segment
 from warp_reflect.settings import Settings, Technique
-from warp_reflect.techniques import baking, forward, grid
+from warp_reflect.techniques import baking, forward, grid, pieces, planar
 from warp_reflect.techniques.map_search import SearchSettings, is_visible, search_settings, solve_vertex
+from warp_reflect.techniques.pieces import Piece
 from warp_reflect.techniques.vertices import SolveFrame, VertexView, vertices_from
 
 wp.set_module_options({"enable_backward": False})
 
-EDGE_SINE_MAX = 0.3  # 17 degrees; facets of a coarse but smooth body stay below, the rim of a cylinder is far above
+HELD_MIN = 0.25  # of a mirror's area; where its sheets hold less, nearly all of it would be traced anyway
 
 
 @wp.kernel
@@ -96,33 +99,47 @@ class Prepared:
         return self.map.bytes
 
 
-def part_mesh(scene: Scene, part: PartRange) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """(points, triangles, corner normals or None) of a part, scene frame; flat facets get no normals."""
-    triangles = slice(part.first_triangle, part.first_triangle + part.triangle_count)
-    points = scene.host_points[part.first_vertex : part.first_vertex + part.vertex_count]
-    faces = scene.host_triangles[triangles] - part.first_vertex
-    index = scene.host_normal_index[triangles]
-    corner = points[faces].astype(np.float64)
-    facet = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    facet /= np.maximum(np.linalg.norm(facet, axis=1, keepdims=True), 1.0e-300)
-    normals = np.repeat(facet[:, None], 3, axis=1)
-    smooth = index[:, 0] >= 0
-    normals[smooth] = scene.host_normals[index[smooth]]
-    return points, faces, normals
+@dataclass(frozen=True)
+class PreparedPieces:
+    """A mirror of several sheets, each with its map.
+
+    Attributes:
+        reflector: The mirror.
+        pieces: See `pieces.Piece`; triangles that none holds are traced.
+        bytes: Of the maps.
+    """
+
+    reflector: Reflector
+    pieces: list[Piece]
+    bytes: int
 
 
 def applies(scene: Scene, reflector: Reflector) -> tuple[bool, str]:
-    """A closed convex body without sharp edges can be held by one map."""
-    body = scene.body(reflector.part)
-    if not body.convex:
-        return False, body.reason or "not convex: several reflection points per vertex"
-    sine = _sharpest(*part_mesh(scene, scene.parts[reflector.part]))
-    if sine > EDGE_SINE_MAX:
-        return (
-            False,
-            f"sharp edges: its normals jump by a sine of {sine:.2f} (at most {EDGE_SINE_MAX}); a map smooths them",
-        )
-    return True, "closed convex smooth body: one reflection point per vertex"
+    """One map holds a closed convex body without sharp edges; of other mirrors every sheet gets its own."""
+    if _one_map(scene, reflector.part):
+        return True, "closed convex smooth body: one reflection point per vertex"
+    segmentation = scene_segments(scene, reflector.part)
+    if segmentation.held < HELD_MIN:
+        body = scene.body(reflector.part)
+        why = body.reason or ("not convex" if not body.convex else "sharp edges")
+        return False, f"{why}; {segmentation} (at least {100 * HELD_MIN:.0f} % wanted)"
+    return True, str(segmentation)
+
+
+def passes(scene: Scene, reflector: Reflector) -> int:
+    """How often a frame reflects every vertex of the scene."""
+    return 1 if _one_map(scene, reflector.part) else len(scene_segments(scene, reflector.part).segments)
+
+
+def scene_segments(scene: Scene, part: int) -> Segmentation:
+    """The sheets of a part; kept with the scene."""
+    if part not in scene.segmentations:
+        scene.segmentations[part] = segment(*part_mesh(scene, scene.parts[part]))
+    return scene.segmentations[part]
+
+
+def _one_map(scene: Scene, part: int) -> bool:
+    return scene.body(part).convex and _sharpest(*part_mesh(scene, scene.parts[part])) <= EDGE_SINE_MAX
 
 
 def _sharpest(points: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> float:
@@ -141,11 +158,13 @@ def _sharpest(points: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> flo
     return min(1.0, 2.0 * half)
 
 
-def prepare(scene: Scene, reflector: Reflector, settings: Settings) -> Prepared:
-    """Draw the map of a reflector; gprims are polished onto their analytic surface."""
+def prepare(scene: Scene, reflector: Reflector, settings: Settings) -> Prepared | PreparedPieces:
+    """Draw the map of a reflector, or those of its sheets; gprims are polished onto their analytic surface."""
     part = scene.parts[reflector.part]
+    if not _one_map(scene, reflector.part):
+        return _prepare_pieces(scene, reflector, settings)
     points, faces, normals = part_mesh(scene, part)
-    polish = _Polish(scene, part) if any(scene.patch_shapes[k] is not None for k in part.patches) else None
+    polish = _polish(scene, part)
     resolution, body = settings.map_resolution, scene.body(reflector.part)
     draw = partial(
         ReflectorMap.from_mesh,
@@ -163,9 +182,74 @@ def prepare(scene: Scene, reflector: Reflector, settings: Settings) -> Prepared:
     return Prepared(reflector, drawn, drawn.unit_from_body, cells)
 
 
-def drawn_maps(prepared: Prepared) -> list[ReflectorMap]:
+def _prepare_pieces(scene: Scene, reflector: Reflector, settings: Settings) -> PreparedPieces:
+    part = scene.parts[reflector.part]
+    points, faces, normals = part_mesh(scene, part)
+    polish = _polish(scene, part)
+    found: list[Piece] = []
+    total = 0
+    for sheet_of in scene_segments(scene, reflector.part).segments:
+        members = sheet_of.triangles
+        own = members + part.first_triangle
+        numbered = replace(reflector, id=len(found) + 1, convex=False)
+        if sheet_of.kind == "planar":
+            frame = planar.plane_frame(*_mean_plane(points[faces[members]].astype(np.float64)))
+            found.append(Piece(own, planar, planar.Prepared(numbered, frame)))
+            continue
+        draw = partial(
+            ReflectorMap.from_sheet,
+            points,
+            faces[members],
+            sheet_of.sheet,
+            settings.map_resolution,
+            normals=normals[members],
+            polish=None if polish is None else _Members(polish, members),
+            device=scene.device,
+        )
+        drawn = baking.baked_or_drawn(scene, part, faces[members], settings.map_resolution, draw)
+        total += drawn.bytes
+        prepared = Prepared(numbered, drawn, drawn.unit_from_body)
+        found.append(Piece(own, sys.modules[__name__], prepared, _Side(sheet_of.sheet.centre)))
+    return PreparedPieces(reflector, found, total)
+
+
+def drawn_maps(prepared: Prepared | PreparedPieces) -> list[ReflectorMap]:
     """The maps of a mirror, in the order of its pieces."""
-    return [prepared.map]
+    if isinstance(prepared, Prepared):
+        return [prepared.map]
+    return [piece.prepared.map for piece in prepared.pieces if isinstance(piece.prepared, Prepared)]
+
+
+def _mean_plane(corner: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """(point, unit normal, size) of flat triangles."""
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]).sum(axis=0)
+    flat = corner.reshape(-1, 3)
+    return flat.mean(axis=0), normal / np.linalg.norm(normal), float(np.ptp(flat, axis=0).max())
+
+
+@dataclass(frozen=True)
+class _Side:
+    """Which pixels see a sheet from outside its convex body: normals on the eye's side point away from the centre."""
+
+    centre: np.ndarray
+
+    def __call__(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        return np.einsum("ij,ij->i", normals, points - self.centre) > 0.0
+
+
+@dataclass(frozen=True)
+class _Members:
+    """A polish for some of a part's triangles."""
+
+    polish: _Polish
+    members: np.ndarray
+
+    def __call__(self, triangle, origin, directions, distance):
+        return self.polish(self.members[triangle], origin, directions, distance)
+
+
+def _polish(scene: Scene, part: PartRange) -> _Polish | None:
+    return _Polish(scene, part) if any(scene.patch_shapes[k] is not None for k in part.patches) else None
 
 
 class _Polish:
@@ -224,7 +308,11 @@ def reflect(
     settings: Settings,
     history=None,
 ) -> ReflectionLayer:
-    """Search every vertex, draw the virtual meshes, refine: see `forward.reflect`."""
+    """Search every vertex, draw the virtual meshes, refine: see `forward.reflect` and, for sheets, `pieces.reflect`."""
+    if isinstance(prepared, PreparedPieces):
+        method = Technique.REFLECTOR_MAP
+        mirror, found = prepared.reflector, prepared.pieces
+        return pieces.reflect(scene, mirror, method, found, gbuffer, pixels, camera, settings, history)
     part = scene.parts[prepared.reflector.part]
     chosen = search_settings(settings, prepared.map.resolution)
     statistics = {}
