@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from warp_reflect import __version__, images, raster, shade, surface
+from warp_reflect import __version__, images, motion, raster, shade, surface
 from warp_reflect.channels import CHANNELS, POINTS, component_of, known_names, reflection_channels
 from warp_reflect.layers import Camera, GBuffer, ReflectionLayer, add_statistics
 from warp_reflect.planner import Plan, find_camera
@@ -37,7 +37,10 @@ class Frame:
         layers: dict[int, ReflectionLayer],
         picture: tuple,
         timings: dict[str, float],
+        previous: Frame | None = None,
     ):
+        # Not the previous frame itself: each would keep the one before it alive.
+        self._before = None if previous is None else (previous.scene, previous.camera)
         self.scene, self.plan, self.gbuffer, self.layers = scene, plan, gbuffer, layers
         self.camera: Camera = gbuffer.camera
         self.timings = timings
@@ -138,7 +141,7 @@ class Frame:
         if group == "reflectorId":
             return self.gbuffer.reflector_id.numpy().reshape(height, width).astype(np.float32)
         if group == "reflectionMotion":
-            return np.zeros((height, width, 2), np.float32)
+            return self._motion
         if group in self._direct:
             image = self._direct[group].numpy().astype(np.float32)
             return image.reshape((height, width, 3) if group == "N" else (height, width))
@@ -147,6 +150,14 @@ class Frame:
     @cached_property
     def _direct(self) -> dict:
         return surface.surface_channels(self.scene, self.gbuffer, self.plan.settings.threads)
+
+    @cached_property
+    def _motion(self) -> np.ndarray:
+        if self._before is None:
+            width, height = self.camera.size
+            return np.zeros((height, width, 2), np.float32)
+        threads = self.plan.settings.threads
+        return motion.reflection_motion(self.scene, self.gbuffer, self.layers, *self._before, threads)
 
     @cached_property
     def _reflection(self) -> dict[str, np.ndarray]:
@@ -160,7 +171,7 @@ def render_frame(scene: Scene, plan: Plan, camera: str | Camera | None = None, p
         scene: The plan's scene, or the same stage at another time.
         plan: From `make_plan`; keeps what its techniques prepare.
         camera: Another camera than the plan's; None: the plan's.
-        previous: The last frame; searches start from its reflection points.
+        previous: The last frame; searches start from its reflection points, and motion is measured from it.
 
     Returns:
         A `Frame`.
@@ -195,7 +206,7 @@ def render_frame(scene: Scene, plan: Plan, camera: str | Camera | None = None, p
     for layer in layers.values():
         for step, ms in layer.timings.items():
             timings["reflect/" + step] = timings.get("reflect/" + step, 0.0) + ms
-    return Frame(scene, plan, gbuffer, layers, picture, timings)
+    return Frame(scene, plan, gbuffer, layers, picture, timings, previous)
 
 
 def _history(previous: Frame | None, scene: Scene, reflector: int):
