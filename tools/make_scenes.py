@@ -332,7 +332,7 @@ def _two_spheres(w: Writer) -> None:
 
 
 def _open_bowl(w: Writer) -> None:
-    """A thin double-sided shell: its rim is a border (no closed map holds it) and inside it sees itself."""
+    """A thin double-sided shell: its rim is a border, and inside it sees itself."""
     d = w.detail
     studio(w, 4.0, 4.2)
     t = np.linspace(-math.pi / 2, -0.1, d.count(10) + 1)
@@ -400,11 +400,17 @@ SCENES = {
     "two_spheres": Recipe(_two_spheres, "Two spheres that see each other", ("/World/Left", "/World/Right")),
     "open_bowl": Recipe(
         _open_bowl,
-        "An open double-sided bowl: no map can hold it, so it is traced",
+        "An open double-sided bowl: half an ellipsoid, from outside and from within",
         ("/World/Bowl",),
-        techniques=("raytraced",),
+        techniques=("quadric", "raytraced"),
+        allowed=("reflector_map",),
     ),
-    "mesh_kettle": Recipe(_mesh_kettle, "A convex mesh of revolution close up", ("/World/Kettle/Body",)),
+    "mesh_kettle": Recipe(
+        _mesh_kettle,
+        "A convex mesh of revolution close up",
+        ("/World/Kettle/Body",),
+        techniques=("reflector_map", "raytraced"),
+    ),
     "far_offset": Recipe(
         _far_offset,
         "sphere_on_checker moved by (1e7, 0, -2e7): the picture must not change",

@@ -285,8 +285,8 @@ CURVED_SCENES = {
         _shaving_mirror,
         "A concave spherical cap: near things upright and large, far ones upside down",
         ("/World/Mirror",),
-        techniques=("raytraced",),
-        allowed=("quadric", "reflector_map"),
+        techniques=("quadric", "raytraced"),
+        allowed=("reflector_map",),
     ),
     "torus": Recipe(
         _torus,

@@ -245,7 +245,7 @@ class Recipe:
     make: Callable[[Writer], None]
     description: str
     reflectors: tuple[str, ...]
-    techniques: tuple[str, ...] = ("reflector_map", "raytraced")
-    allowed: tuple[str, ...] = ("quadric",)
+    techniques: tuple[str, ...] = ("quadric", "reflector_map", "raytraced")
+    allowed: tuple[str, ...] = ()
     max_error_px: float = 0.5
     min_identical: float = 0.999
