@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from rooms import identical, placed, plane_room, render, room, sphere
 
+import warp_reflect as wr
 from warp_reflect.scene import Scene
 
 
@@ -123,3 +124,12 @@ def test_motion_of_what_was_not_there_is_zero(ball_room):
     new = now["reflectedId"] > 2
     assert new.any()
     assert not now["reflectionMotion"][new].any()
+
+
+def test_plan_of_one_time_renders_another(ball_room):
+    plan = wr.make_plan(ball_room, size=(160, 90), method="reflector_map")
+    first = wr.render_frame(ball_room, plan)
+    scene = moved(ball_room, "/mirror", np.array([0.3, 0.1, 0.2]))
+    now = wr.render_frame(scene, plan, previous=first)
+    assert now.statistics == render(scene, "reflector_map").statistics
+    assert identical(now, render(scene, "reference")) > 0.995

@@ -168,7 +168,7 @@ def render_frame(scene: Scene, plan: Plan, camera: str | Camera | None = None, p
     """Render a scene as planned.
 
     Args:
-        scene: The plan's scene, or the same stage at another time.
+        scene: The plan's scene, or the same stage at another time, which is planned anew (`Frame.plan`).
         plan: From `make_plan`; keeps what its techniques prepare.
         camera: Another camera than the plan's; None: the plan's.
         previous: The last frame; searches start from its reflection points, and motion is measured from it.
@@ -177,6 +177,7 @@ def render_frame(scene: Scene, plan: Plan, camera: str | Camera | None = None, p
         A `Frame`.
     """
     timer = StageTimer(scene.device)
+    plan = plan.at(scene)
     settings = plan.settings
     view = plan.camera if camera is None else find_camera(scene, camera, plan.size)
     with timer("raster"):

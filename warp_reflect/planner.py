@@ -77,6 +77,14 @@ class Plan:
             self._prepared[row.reflector.id] = technique.prepare(self.scene, row.reflector, row.settings)
         return self._prepared[row.reflector.id]
 
+    def at(self, scene: Scene) -> Plan:
+        """The plan for its stage at another time: decided anew, with its own camera there."""
+        if scene is self.scene:
+            return self
+        moving = any(camera.path == self.camera.path for camera in scene.data.cameras)
+        camera = self.camera.path if moving else self.camera
+        return make_plan(scene, camera, self.size, self.settings, self.method, earlier=self)
+
     def to_json(self) -> dict:
         """The plan as `warp-reflect plan --json` prints it."""
         return {
