@@ -84,6 +84,8 @@ class Settings:
     """A virtual vertex of the previous frame is kept while the bound on its drift stays below this; 0: off. [pixels]"""
     occlusion: str = "exact"
     """What hides what in a virtual picture: `exact` (path length per pixel) or `painter` (one depth a triangle; no refine)."""
+    explosion_walk: int = 64
+    """Neighbour triangles an `explosion_map` look-up may walk over; 0: none, the paper's far map."""
     edge_px: float = 0.25
     """Virtual triangles are cut until a straight edge's picture bends by less than this; 0: never cut. [pixels]"""
     refine: str = "exact"
@@ -110,6 +112,7 @@ class Settings:
         _require(self.occlusion in OCCLUSIONS, "occlusion", self.occlusion, f"one of {', '.join(OCCLUSIONS)}")
         painted = self.occlusion == "painter" and self.refine != "off"
         _require(not painted, "occlusion", self.occlusion, "exact, or refine=off with it")
+        _require(0 <= self.explosion_walk <= 10000, "explosion_walk", self.explosion_walk, "0 to 10000")
         _require(0.0 <= self.edge_px <= 1.0e6, "edge_px", self.edge_px, "0 (never cut) or a number of pixels")
         _require(self.refine in REFINEMENTS, "refine", self.refine, f"one of {', '.join(REFINEMENTS)}")
         _require(self.complexity in COMPLEXITIES, "complexity", self.complexity, f"one of {', '.join(COMPLEXITIES)}")

@@ -1,5 +1,11 @@
 """One method a file. `TECHNIQUES` maps a name to the module that has `applies`, `prepare` and `reflect`."""
 
-from warp_reflect.techniques import planar, quadric, raytraced, reflector_map
+from warp_reflect.techniques import explosion_map, planar, quadric, raytraced, reflector_map
 
-TECHNIQUES = {"planar": planar, "quadric": quadric, "reflector_map": reflector_map, "raytraced": raytraced}
+TECHNIQUES = {
+    "planar": planar,
+    "quadric": quadric,
+    "reflector_map": reflector_map,
+    "explosion_map": explosion_map,
+    "raytraced": raytraced,
+}
