@@ -492,14 +492,25 @@ class EnvironmentMap:
                     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1.0e-30)
                     surface.point_data.active_normals = normals.astype(np.float32)
                 look = {"pbr": True, "metallic": 1.0, "roughness": 0.0} if part in mirrors else {"lighting": False}
-                self.plotter.add_mesh(surface, color=shown(np.array(material.base_color)).tolist(), **look)
+                if material.uses_vertex_color and corner["colors"] is not None:
+                    surface.point_data["color"] = np.round(255.0 * shown(corner["colors"])).astype(np.uint8)
+                    look |= {"scalars": "color", "rgb": True}
+                else:
+                    look["color"] = shown(np.array(material.base_color)).tolist()
+                self.plotter.add_mesh(surface, **look)
                 part += 1
         self.plotter.set_environment_texture(self._texture(scene, middle), is_srgb=True)
+        # A smooth metal needs neither diffuse nor blurred copies, whose making takes minutes without a GPU.
+        renderer = self.plotter.renderer
+        renderer.GetEnvMapIrradiance().SetIrradianceSize(4)
+        renderer.GetEnvMapIrradiance().SetIrradianceStep(0.5)
+        renderer.GetEnvMapPrefiltered().SetPrefilterMaxSamples(4)
         eye = camera.eye - scene.origin
         view = self.plotter.camera
         view.position, view.focal_point, view.up = eye, eye + camera.forward, camera.up
         view.view_angle = float(np.degrees(2.0 * np.arctan(0.5 * camera.size[1] / camera.fy)))
-        view.clipping_range = (camera.near, min(camera.far, 1.0e4 * camera.near))
+        distance = float(np.linalg.norm(eye - scene.host_points.mean(axis=0)))
+        view.clipping_range = (1.0e-3 * scene.size, 2.0 * scene.size + distance)
         self.seen = None
 
     @classmethod
@@ -528,17 +539,17 @@ class EnvironmentMap:
         texture.SetCubeMap(True)
         x, y, z = np.eye(3)
         # OpenGL 4.6 core specification, table 8.19: (forward, along the columns, along the rows).
+        # VTK looks its environment up with z turned round.
         faces = [(x, -z, -y), (-x, z, -y), (y, x, z), (-y, x, -z), (z, x, -y), (-z, -x, -y)]
         half = 0.5 * ENVIRONMENT_SIDE
         near = 1.0e-3 * scene.size
-        for k, (forward, column, row) in enumerate(faces):
-            # Seen from inside the columns run to the left: drawn to the right, and turned round.
-            camera = Camera(
-                middle, -column, -row, forward, half, half, half, half, near, 1.0e3 * near, (2 * int(half),) * 2
-            )
-            frame = wr.render_frame(empty, wr.make_plan(empty, camera, camera.size, method="reference"))
-            texels = np.round(255.0 * shown(picture(frame))[:, ::-1]).astype(np.uint8)
-            image = pv.ImageData(dimensions=(*camera.size, 1))
+        side = (ENVIRONMENT_SIDE, ENVIRONMENT_SIDE)
+        for k, axes in enumerate(faces):
+            forward, column, row = (axis * [1.0, 1.0, -1.0] for axis in axes)
+            camera = Camera(middle, column, -row, forward, half, half, half, half, near, 1.0e4 * near, side)
+            frame = wr.render_frame(empty, wr.make_plan(empty, camera, side, method="reference"))
+            texels = np.round(255.0 * shown(picture(frame))).astype(np.uint8)
+            image = pv.ImageData(dimensions=(*side, 1))
             image.point_data["color"] = texels.reshape(-1, 3)
             image.set_active_scalars("color")
             texture.SetInputDataObject(k, image)

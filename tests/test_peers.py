@@ -1,0 +1,43 @@
+"""The parts of the comparison with other renderers that need none of them but Embree."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import warp_reflect as wr
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.fixture
+def peers(monkeypatch):
+    monkeypatch.setattr(sys, "path", [str(ROOT / "tools"), *sys.path])
+    import peers
+
+    return peers
+
+
+def test_wavefront_finds_the_triangles_of_the_reference(peers):
+    scene = wr.load_stage(ROOT / "usd_scenes" / "sphere_on_checker.usda")
+    frame = wr.render_frame(scene, wr.make_plan(scene, size=(96, 54), method="reference"))
+    wavefront = peers.Wavefront(scene, frame)
+    wavefront.trace()
+    # Its mirror is faceted, and its rays leave a step off the surface: neighbours are met at some triangles' edges.
+    assert wavefront.agreement() > 0.9
+    assert len(wavefront.pixel) == pytest.approx(np.count_nonzero(frame["reflectorId"]), rel=0.02)
+
+
+def test_psnr_is_of_the_displayed_pictures(peers):
+    a, b = (np.full((4, 5, 3), value, np.float32) for value in (4.0, 1.0))
+    assert peers.psnr(a, b) == pytest.approx(120.0)  # both are shown white
+    black = np.zeros_like(a)
+    half = np.full_like(a, 0.21404114)  # shown as 0.5
+    assert peers.psnr(half, black) == pytest.approx(20.0 * np.log10(2.0), abs=1e-4)
+    there = np.zeros((4, 5), bool)
+    there[0] = True
+    half[1:] = 0.0
+    assert peers.psnr(half, black, there) == pytest.approx(20.0 * np.log10(2.0), abs=1e-4)
