@@ -22,7 +22,7 @@ FILES = {
 FLOORS = {
     1: "settings launch devices optics shapes bodies cubemap quadrics quadric_roots quadric_curve quadric_fit heightfield "
     "images metrics timing",
-    2: "scene baked_maps segments layers bvh raster shade surface textures normal_maps direct channels stage stage.*",
+    2: "scene baked_maps segments layers bvh raster shade surface pictures textures normal_maps direct channels stage stage.*",
     3: "solve solver solve_device solve_plane solve_convex solve_map solve_general solve_qim solver_gradients mirrors "
     "reflector_maps techniques techniques.* finishes finishes.*",
     4: "planner budget bake frame motion sweep",

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from warp_reflect import raster, shade, surface, textures
+from warp_reflect import pictures, raster, shade, surface, textures
 from warp_reflect.images import write_exr, write_png
 from warp_reflect.layers import Camera
 from warp_reflect.scene import InstanceData, LightData, MaterialData, MeshData, Scene, SceneData, TextureRef
@@ -152,7 +152,7 @@ def test_constant_picture_looks_as_the_constant(device, tmp_path, height):
     file = TextureRef(str(tmp_path / "flat.exr"))
     values = {"base_color": (0.25, 0.25, 0.25), "metallic": 0.25, "roughness": 0.25, "clearcoat": 0.25}
     plain = MaterialData("/m", **values)
-    looked = {"base_color": file} | {n: dataclasses.replace(file, channel="r") for n in textures.NUMBERS}
+    looked = {"base_color": file} | {n: dataclasses.replace(file, channel="r") for n in pictures.NUMBERS}
     camera = looking_down(height)
     one, triangle = picture_of(scene_of([(quad(), np.eye(4), plain)], device), camera)
     scene = scene_of([(quad(), np.eye(4), MaterialData("/m", textures=looked))], device)
@@ -198,7 +198,7 @@ def test_level_follows_the_path_through_a_mirror(device, tmp_path):
 def test_white_furnace_holds_for_any_textured_metallic_and_roughness(device, tmp_path):
     rng = np.random.default_rng(5)
     write_exr(tmp_path / "n.exr", {"RGB": rng.uniform(0, 1, (16, 16, 3)).astype(np.float32)}, half=())
-    channel = {name: TextureRef(str(tmp_path / "n.exr"), c) for name, c in zip(textures.NUMBERS, "rgbr", strict=True)}
+    channel = {name: TextureRef(str(tmp_path / "n.exr"), c) for name, c in zip(pictures.NUMBERS, "rgbr", strict=True)}
     material = MaterialData("/m", base_color=(1.0, 1.0, 1.0), textures=channel)
     rgba, triangle = picture_of(scene_of([(quad(4.0), np.eye(4), material)], device), looking_down(2.0))
     assert (triangle >= 0).all()
@@ -256,7 +256,7 @@ def test_pictures_that_came_with_the_data_need_no_file(device, noise, tmp_path):
     )
     camera = looking_down(3.0)
     expected, _ = picture_of(Scene(data, device), camera)
-    packed = textures.with_pictures(data)
+    packed = pictures.with_pictures(data)
     assert len(packed.pictures) == 2 and any("none.exr" in note.text for note in packed.notes)
     (tmp_path / "noise.exr").unlink()
     np.testing.assert_array_equal(picture_of(Scene(packed, device), camera)[0], expected)
@@ -271,14 +271,14 @@ def test_scene_without_textures_holds_none(device):
 @pytest.mark.parametrize("size", [(64, 64), (37, 53), (1, 9), (130, 7)])
 def test_every_level_keeps_the_mean(size):
     picture = np.random.default_rng(2).uniform(0, 1, (*size, 3)).astype(np.float32)
-    pyramid = textures.make_pyramid(textures.reduced(picture, 48))
+    pyramid = pictures.make_pyramid(pictures.reduced(picture, 48))
     assert max(pyramid.levels[0].shape[:2]) <= 48 and pyramid.levels[-1].shape == (1, 1, 3)
     for level in pyramid.levels:
         np.testing.assert_allclose(level.mean(axis=(0, 1)), picture.mean(axis=(0, 1)), atol=1e-5)
 
 
 def test_too_many_texels_cost_the_finest_levels(monkeypatch):
-    pyramids = {k: textures.make_pyramid(np.zeros((s, s, 3), np.float32)) for k, s in (("a", 64), ("b", 16))}
+    pyramids = {k: pictures.make_pyramid(np.zeros((s, s, 3), np.float32)) for k, s in (("a", 64), ("b", 16))}
     monkeypatch.setattr(textures, "TEXELS_MAX", 4000)
     kept = textures._within_budget(pyramids)
     assert sum(level.size for levels in kept.values() for level in levels) <= 4000
@@ -365,7 +365,7 @@ def test_tiles_that_came_with_the_data_need_no_file(device, tmp_path):
     data = SceneData("test", [mesh], [InstanceData(0, np.eye(4), "/p", (0,))], [material], lights, [])
     camera = looking_down(5.0)
     expected, _ = picture_of(Scene(data, device), camera)
-    packed = textures.with_pictures(data)
+    packed = pictures.with_pictures(data)
     for file in tmp_path.glob("set.*.exr"):
         file.unlink()
     np.testing.assert_array_equal(picture_of(Scene(packed, device), camera)[0], expected)
@@ -384,7 +384,7 @@ def test_samples_that_are_no_light_are_counted_in_a_note(device, tmp_path, packe
     material = dataclasses.replace(MATT, textures={"base_color": TextureRef(file)})
     scene = scene_of([(quad(), np.eye(4), material)], device)
     if packed:
-        scene = Scene(textures.with_pictures(scene.data), device)
+        scene = Scene(pictures.with_pictures(scene.data), device)
         scene.notes += scene.data.notes
     for _ in range(2):
         rgba, _ = picture_of(scene, looking_down(3.0))

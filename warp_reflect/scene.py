@@ -207,7 +207,7 @@ class SceneData:
     environment_maps: list[EnvironmentMapData] = field(default_factory=list)
     # By the path of the prim or GeomSubset that carries them; not compared with the geometry yet.
     baked_maps: dict[str, tuple[BakedMap, ...]] = field(default_factory=dict)
-    # Textures that were read with the stage, by `textures.picture_key`, float32 [h, w, 1 or 3]; None: read from files
+    # Textures that were read with the stage, by `pictures.picture_key`, float32 [h, w, 1 or 3]; None: read from files
     # when they are needed.
     pictures: dict[str, np.ndarray] | None = None
 
@@ -303,9 +303,9 @@ class Scene:
         self.segmentations: dict = {}  # part -> its sheets (`segments.Segmentation`), likewise
         self._pyramids: dict = {}
         if any(material.textures for material in data.materials):
-            from warp_reflect import textures
+            from warp_reflect import pictures
 
-            materials, notes, self._pyramids = textures.mirror_constants(data)
+            materials, notes, self._pyramids = pictures.mirror_constants(data)
             self.data = data = replace(data, materials=materials)
             self.notes += [note for note in notes if note not in self.notes]
         self.origin = _scene_origin(data)

@@ -12,11 +12,11 @@ def main() -> int:
     arguments = json.load(sys.stdin)
     folder = Path(arguments.pop("folder"))
     limit_memory(arguments.pop("memory_bytes"))
+    from warp_reflect.pictures import with_pictures
     from warp_reflect.stage.guard import Limits
     from warp_reflect.stage.layers import check_layers
     from warp_reflect.stage.read import read_stage
     from warp_reflect.stage.transfer import save
-    from warp_reflect.textures import with_pictures
 
     arguments["limits"] = Limits(**arguments["limits"])
     try:
