@@ -278,7 +278,7 @@ def test_signal_stops_after_the_frame_at_hand_and_says_how_to_go_on(render, afte
     assert names(out) == ["a.1.exr", "a.2.exr"]
     assert list(contents()) == ["a.1.exr", "a.2.exr"]
     assert err[-1] == (
-        f"stopped by {number.name} before frame 3, 3 of 5 frames left; the same command with --resume goes on"
+        f"stopped by {number.name}: from frame 3 on 3 of 5 frames are left; the same command with --resume goes on"
     )
     assert signal.getsignal(number) is before
     assert render("a.#.exr", "-f", "1:5", "--resume")[0] == 0
@@ -297,7 +297,7 @@ def test_second_signal_stops_at_once_and_leaves_no_part_of_a_file(render, monkey
     monkeypatch.setattr(images, "_write_whole", interrupted)
     code, _, err = render("a.#.exr", "-f", "1:3")
     assert code == 130
-    assert "2 of 3 frames left" in err[-1]
+    assert "2 of 3 frames are left" in err[-1]
     assert sorted(os.listdir()) == ["a.1.exr", "look.usda", "stage.usda"]
 
 
@@ -350,7 +350,7 @@ def test_time_limit_is_told(render):
     code, out, err = render("a.#.exr", "-f", "1:3", "--timelimit", "0")
     assert (code, out) == (1, [])
     assert err == [
-        "stopped by the time limit before frame 1, 3 of 3 frames left; the same command with --resume goes on"
+        "stopped by the time limit: from frame 1 on 3 of 3 frames are left; the same command with --resume goes on"
     ]
 
 

@@ -50,6 +50,7 @@ def render_on_cluster(
     Raises:
         ValueError: dask is not installed.
         OSError: the scheduler does not answer.
+        ConnectionError: it went away.
     """
     try:
         import distributed
@@ -105,7 +106,7 @@ def render_on_cluster(
                     text = "its worker died every time it was tried" if lost else one_line(error)
                     ended = [Outcome(place, "failed", text) for place in left]
                 else:
-                    ended = [Outcome(place, "failed", "the scheduler was lost") for place in left]
+                    raise ConnectionError("the scheduler was lost")
                 for outcome in ended:
                     if outcome.place not in told:
                         told.add(outcome.place)
@@ -122,7 +123,9 @@ def _batches(job: Job, places: list[int], size: int) -> list[list[int]]:
 @contextlib.contextmanager
 def _client(distributed, job: Job, workers: int, scheduler: str | None) -> Iterator:
     """A client of a running scheduler, or of a cluster that lives as long as this context."""
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    for name in list(logging.root.manager.loggerDict):
+        if name.partition(".")[0] == "distributed":
+            logging.getLogger(name).setLevel(logging.CRITICAL)  # what matters of it is told of the frames
     if scheduler is not None:
         try:
             client = distributed.Client(scheduler, timeout=SCHEDULER_SECONDS, set_as_default=False)
@@ -141,7 +144,10 @@ def _client(distributed, job: Job, workers: int, scheduler: str | None) -> Itera
         threads_per_worker=1,
         processes=True,
         host="127.0.0.1",
-        dashboard_address=None,
+        # Nothing listens beyond this machine.
+        dashboard_address="127.0.0.1:0",
+        worker_dashboard_address="127.0.0.1:0",
+        scheduler_kwargs={"dashboard": False},
         silence_logs=logging.CRITICAL,
         memory_limit=0,  # frames hold what they need: there is nothing to spill
         env={CORES_VARIABLE: threads, "OPENIMAGEIO_THREADS": threads},

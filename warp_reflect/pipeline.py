@@ -449,6 +449,8 @@ def _tell_all(source, job: Job, report: Report, asked: Asked, states: dict[int, 
             report.frame(job, outcome)
     except KeyboardInterrupt:
         asked.signal = asked.signal or signal.SIGINT
+    except ConnectionError as error:
+        asked.lost = one_line(error)
 
 
 def _conclude(job: Job, places: list[int], states: dict[int, str], asked: Asked, report: Report) -> int:
@@ -462,10 +464,10 @@ def _conclude(job: Job, places: list[int], states: dict[int, str], asked: Asked,
     elif bad and written:
         report.line(f"kept {len(written):,} finished file{'s' if len(written) > 1 else ''}: {_shortened(written)}")
     if left:
-        why = f"stopped by {asked.signal.name}" if asked.signal else "stopped by the time limit"
+        why = f"stopped by {asked.signal.name}" if asked.signal else asked.lost or "stopped by the time limit"
         report.line(
-            f"{why} before {job.label(next(place for place in places if place not in states))}, "
-            f"{left:,} of {len(places):,} frames left; the same command with --resume goes on"
+            f"{why}: from {job.label(next(place for place in places if place not in states))} on "
+            f"{left:,} of {len(places):,} frames are left; the same command with --resume goes on"
         )
         if asked.signal:
             code = 128 + asked.signal
@@ -515,10 +517,12 @@ class Asked:
     Attributes:
         signal: The one that asked to stop.
         finished: Files of the last frame finished here.
+        lost: What went away, so that no frame can be made any more.
     """
 
     signal: signal.Signals | None = None
     finished: tuple[str, ...] = ()
+    lost: str = ""
 
     def is_stopped(self) -> bool:
         """Whether no further frame is to be begun."""

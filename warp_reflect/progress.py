@@ -38,6 +38,8 @@ class Report:
         """So many frames are to be rendered."""
         self._total = total
         self._event("begin", frames=total)
+        if self.style == "alf" and not total:
+            self._tell("ALF_PROGRESS 100%")
         if self._bar is not None and total > 1:
             self._bar.update(self._task, total=total)
 
