@@ -338,9 +338,10 @@ def _sensor(camera, size: tuple[int, int], samples: int) -> dict:
     """A UsdGeomCamera at the origin; the aperture is widened so that pixels are square."""
     width, height = size
     axes = np.asarray(camera.world_from_camera, np.float64)[:3, :3]
+    axes = axes / np.linalg.norm(axes, axis=0)
     to_world = np.eye(4)
     # Mitsuba's cameras look along +Z and have +X on the left.
-    to_world[:3, :3] = axes / np.linalg.norm(axes, axis=0) * [-1.0, 1.0, -1.0]
+    to_world[:3, :3] = axes * [-1.0, 1.0, -1.0]
     aperture = max(camera.horizontal_aperture, camera.vertical_aperture * width / height)
     sensor = {
         "to_world": mi.ScalarTransform4f(to_world),
@@ -351,6 +352,7 @@ def _sensor(camera, size: tuple[int, int], samples: int) -> dict:
     }
     if camera.projection == "orthographic":
         half = 0.05 * aperture  # apertures are tenths of a scene unit
+        to_world[:3, 3] = 0.1 * axes @ [camera.horizontal_offset, camera.vertical_offset, 0.0]
         to_world = to_world @ np.diag([half, half, 1.0, 1.0])
         return {**sensor, "type": "orthographic", "to_world": mi.ScalarTransform4f(to_world)}
     return {
@@ -358,8 +360,8 @@ def _sensor(camera, size: tuple[int, int], samples: int) -> dict:
         "type": "perspective",
         "fov_axis": "x",
         "fov": float(np.degrees(2.0 * np.arctan(0.5 * aperture / camera.focal_length))),
-        "principal_point_offset_x": -float(camera.horizontal_offset) / aperture,
-        "principal_point_offset_y": float(camera.vertical_offset) / (aperture * height / width),
+        "principal_point_offset_x": float(camera.horizontal_offset) / aperture,
+        "principal_point_offset_y": -float(camera.vertical_offset) / (aperture * height / width),
     }
 
 
