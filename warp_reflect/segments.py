@@ -30,17 +30,15 @@ PIECE_SHARE = 0.004  # of the mesh's area: a smaller sheet is not worth a pass o
 PIECES_MAX = 16
 SPLIT_DEPTH = 5
 NORMAL_WEIGHT = 0.7  # of a unit normal against a position in sizes, where a region is split in two
-COSINE_MIN = (
-    0.08  # 85 degrees between a facet's normal and the ray that reaches it: its map is not stretched beyond use
-)
-# Of a sheet's size: a corner may stand out over other facets by so much. Candidates are wrong by about as much there, which
-# refinement forgives.
+# 85 degrees between a facet's normal and the ray that reaches it: beyond, its map is stretched too much to be of use.
+COSINE_MIN = 0.08
+# Of a sheet's size: a corner may stand out over other facets by so much. Where a sheet is not convex a vertex has pictures
+# that a search for one does not find: at 1e-2 one pixel in 300 of a car showed what lies behind, at 2e-3 one in 1600.
 OVERHANG_MAX = 2.0e-3
 TRIM_SHARE = 0.5  # of a region's area that must be left when its overhung triangles are cut off; else it is halved
 FLATNESS_MAX = 1.0e-6  # of a sheet's size: off its plane by less it is a plane
 
-KINDS = ("flat", "convex", "concave", "saddle")
-FLAT, CONVEX, CONCAVE, SADDLE = range(4)
+FLAT, CONVEX, CONCAVE, SADDLE, SHARP = range(5)
 
 
 @dataclass(frozen=True)
@@ -50,7 +48,7 @@ class Segment:
     Attributes:
         triangles: Ascending ids into the mesh's triangles, int64 [n].
         kind: "planar", "convex" or "concave", seen from the front of its triangles.
-        sheet: Its frame as the surface of a convex body, which lies behind a convex sheet and before a concave one.
+        sheet: Its frame as the surface of a body, which lies behind a convex sheet and before a concave one.
         area: Of its triangles. [units^2]
     """
 
@@ -68,11 +66,13 @@ class Segmentation:
         segments: At most `PIECES_MAX`.
         held: Share of the area that they hold.
         saddle: Share of the area that curves both ways.
+        sharp: Share of the area that curves more than a map resolves.
     """
 
     segments: list[Segment]
     held: float
     saddle: float
+    sharp: float
 
     def __str__(self) -> str:
         counts = [(kind, sum(s.kind == kind for s in self.segments)) for kind in ("convex", "concave", "planar")]
@@ -82,8 +82,9 @@ class Segmentation:
         text += f"of its triangles' area: {kinds}"
         if self.held < 0.9995:
             text += f"; {100 * (1 - self.held):.1f} % traced"
-            if self.saddle > 0.0005:
-                text += f" ({100 * self.saddle:.1f} % curves both ways)"
+            reasons = [(self.saddle, "curves both ways"), (self.sharp, "curves too sharply")]
+            listed = ", ".join(f"{100 * share:.1f} % {why}" for share, why in reasons if share > 0.0005)
+            text += f" ({listed})" if listed else ""
         return text
 
 
@@ -134,7 +135,7 @@ def segment(points: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> Segme
     region, kind = _absorb_slivers(region, kind, area / total, a, b, length)
     found: list[Segment] = []
     for number in np.unique(region):
-        if kind[number] == SADDLE:
+        if kind[number] in (SADDLE, SHARP):
             continue
         inside = region == number
         place = np.cumsum(inside) - 1
@@ -147,8 +148,8 @@ def segment(points: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> Segme
         Segment(s.triangles, s.kind, s.sheet.placed(size, 0.5 * (low + high)), s.area * size * size) for s in found
     ]
     held = sum(s.area for s in found) / total
-    saddle = float(area[np.asarray([kind[r] == SADDLE for r in region])].sum()) / total
-    return Segmentation(scaled, float(held), saddle)
+    saddle, sharp = (float(area[[kind[r] == k for r in region]].sum()) / total for k in (SADDLE, SHARP))
+    return Segmentation(scaled, float(held), saddle, sharp)
 
 
 def _vertex_normals(welded, unit, area, normals) -> np.ndarray:
@@ -238,7 +239,7 @@ def _label(low, high) -> np.ndarray:
     label[low >= -slack] = CONVEX
     label[(high <= slack) & (low < -slack)] = CONCAVE
     label[largest <= FLAT_CURVATURE] = FLAT
-    label[largest > CURVATURE_MAX] = SADDLE
+    label[largest > CURVATURE_MAX] = SHARP
     return label
 
 
@@ -261,8 +262,8 @@ def components(count: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def _regions(label, solid, a, b) -> tuple[np.ndarray, dict[int, int]]:
     """Connected regions of one kind; flat triangles go with the convex, else the concave region that they touch."""
     region = np.full(len(label), -1)
-    kind: dict[int, int] = {-1: SADDLE}
-    for wanted in (CONVEX, CONCAVE, FLAT, SADDLE):
+    kind: dict[int, int] = {-1: SHARP}
+    for wanted in (CONVEX, CONCAVE, FLAT, SADDLE, SHARP):
         open_ = (region < 0) & solid
         member = open_ & ((label == wanted) | ((label == FLAT) & (wanted in (CONVEX, CONCAVE))))
         inside = member[a] & member[b]
@@ -309,7 +310,7 @@ def _sheets(local, unit, area, total, members, kind, a, b, depth) -> list[Segmen
     corner, normal = local[members], unit[members]
     if _flatness(corner, normal, own) <= FLATNESS_MAX:
         return [Segment(members, "planar", fit_sheet(corner, inner=False), float(own.sum()))]
-    tries = (False, True) if kind == FLAT else (kind == CONCAVE,)
+    tries = {FLAT: (False, True), CONVEX: (False,), CONCAVE: (True,)}[kind]
     for inner in tries:
         sheet = fit_sheet(corner, inner)
         if sheet.cosine >= COSINE_MIN and sheet.overhang <= OVERHANG_MAX:

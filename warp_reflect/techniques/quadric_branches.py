@@ -12,6 +12,7 @@ the lattice around which it turns start Newton's method. Only what the eye can s
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,6 +51,7 @@ STEP_MAX = wp.constant(0.25)  # of the unit
 TOLERANCE = wp.constant(4.0e-6)  # angle
 ACCEPTED = wp.constant(1.0e-3)  # angle above which a start led to no root
 NO_NODE = wp.constant(1.0e30)
+FOLD_STEP = 2.5  # of the edge before it: how far a picture reaches on towards a fold, see `_add_doubt`
 FOLD_REACH = 2.0  # the fold of a caustic lies within twice the straight extrapolation of an edge that crosses it
 FOLD_BUDGET = 4000  # triangles that cutting at folds may add to a branch: each costs a search
 FOLLOW_ROUNDS = 2  # rings of vertices beyond what the lattice found
@@ -343,15 +345,11 @@ def reflect(
     settings: Settings,
     history=None,
 ) -> ReflectionLayer:
-    """Search, cut, draw every branch into one z-buffer, refine."""
-    reflector = prepared.reflector
-    part = scene.parts[reflector.part]
-    layer = ReflectionLayer.empty(pixels, Technique.QUADRIC, scene.device)
+    """Search the branches of every vertex, see `reflect_branches`."""
+    part = scene.parts[prepared.reflector.part]
     if pixels.count == 0:
-        return layer
-    timer = StageTimer(scene.device)
+        return ReflectionLayer.empty(pixels, Technique.QUADRIC, scene.device)
     frame = solve_frame(scene, camera, prepared.unit_from_scene)
-    unit_per_scene = float(np.cbrt(abs(np.linalg.det(prepared.unit_from_scene[:3, :3]))))
     view = lattice(scene, prepared, camera, pixels.box)
 
     def solve(points, has_own: bool) -> list[VertexView]:
@@ -360,6 +358,50 @@ def reflect(
         inputs = [points, *own, view, frame, gbuffer.view, *answers]
         launch(search_branches_kernel, len(points), inputs, scene.device, settings.threads)
         return answers
+
+    def follow(points, pairs: wp.array, branch: int, vertices: VertexView) -> None:
+        inputs = [points, view, frame, gbuffer.view, pairs, branch, vertices]
+        launch(follow_kernel, len(pairs), inputs, scene.device, settings.threads)
+
+    return reflect_branches(
+        scene,
+        prepared.reflector,
+        Technique.QUADRIC,
+        prepared.unit_from_scene,
+        solve,
+        follow,
+        gbuffer,
+        pixels,
+        camera,
+        settings,
+    )
+
+
+def reflect_branches(
+    scene: Scene,
+    reflector: Reflector,
+    technique: int,
+    unit_from_scene: np.ndarray,
+    solve: Callable,
+    follow: Callable,
+    gbuffer: GBuffer,
+    pixels: MirrorPixels,
+    camera: Camera,
+    settings: Settings,
+) -> ReflectionLayer:
+    """Search, cut, draw every branch into one z-buffer, refine.
+
+    Args:
+        technique: `Technique` of the answer.
+        unit_from_scene: float64 [4, 4] similarity into the solver's frame.
+        solve: (points, whether they are the scene's vertices) -> one VertexView per branch, see `write_root`.
+        follow: (points, pairs vec2i of a vertex without the branch and one with it, branch, vertices in and out).
+    """
+    part = scene.parts[reflector.part]
+    layer = ReflectionLayer.empty(pixels, technique, scene.device)
+    timer = StageTimer(scene.device)
+    frame = solve_frame(scene, camera, unit_from_scene)
+    unit_per_scene = float(np.cbrt(abs(np.linalg.det(unit_from_scene[:3, :3]))))
 
     with timer("search"):
         whole = virtual_mesh.whole(scene, part)
@@ -375,8 +417,7 @@ def reflect(
                 scene, part, whole, vertices, frame, solve_into, lambda points, k=k: solve(points, False)[k],
                 unit_per_scene, camera, pixels, settings,
             )  # fmt: skip
-            follow = (k, view, frame, gbuffer.view, settings)
-            _follow(mesh, vertices, *follow)
+            _follow(mesh, vertices, k, follow)
             finer = _cut_at_folds(scene, part, mesh, vertices)
             if finer is not mesh:
                 mesh, known = finer, empty_vertices(finer.vertex_count, scene.device, with_position=True)
@@ -384,7 +425,7 @@ def reflect(
                 copy_vertices(known, vertices, base)
                 solve_into(mesh.points[base:], False, frame, False, vertices_from(known, base))
                 vertices = known
-                _follow(mesh, vertices, *follow)
+                _follow(mesh, vertices, k, follow)
             branches.append((mesh, vertices))
     with timer("virtual_raster"):
         target = raster.make_target(gbuffer.view, pixels.box, scene.device, gbuffer.reflector_id, reflector.id)
@@ -398,7 +439,7 @@ def reflect(
             )
             offset += len(mesh.triangles)
             solved = vertices.status.numpy() == int(Status.CONVERGED)
-            _add_doubt(doubt, mesh, solved, k, solve, unit_per_scene, camera, target.box)
+            _add_doubt(doubt, mesh, vertices, solved, k, solve, unit_per_scene, camera, target.box)
         together = _together([mesh for mesh, _ in branches])
     layer.statistics.update(vertices=sum(mesh.vertex_count for mesh, _ in branches), drawn=drawn)
     if settings.refine == "off":
@@ -436,7 +477,7 @@ def reflect(
     return layer
 
 
-def _follow(mesh: VirtualMesh, vertices: VertexView, branch: int, view, frame, camera, settings: Settings) -> None:
+def _follow(mesh: VirtualMesh, vertices: VertexView, branch: int, follow: Callable) -> None:
     """Give triangles that lack a branch at some corners what can be followed from the others.
 
     The lattice misses roots beyond its border, and pairs of roots that lie in one of its cells.
@@ -452,8 +493,7 @@ def _follow(mesh: VirtualMesh, vertices: VertexView, branch: int, view, frame, c
         if not len(missing):
             return
         pairs = np.stack([missing, np.broadcast_to(known, triangle.shape)[~has][first]], 1).astype(np.int32)
-        inputs = [mesh.points, view, frame, camera, wp.array(pairs, dtype=wp.vec2i, device=device), branch, vertices]
-        launch(follow_kernel, len(pairs), inputs, device, settings.threads)
+        follow(mesh.points, wp.array(pairs, dtype=wp.vec2i, device=device), branch, vertices)
 
 
 def _cut_at_folds(scene: Scene, part, mesh: VirtualMesh, vertices: VertexView) -> VirtualMesh:
@@ -494,7 +534,9 @@ def _together(meshes: list[VirtualMesh]) -> VirtualMesh:
     )
 
 
-def _add_doubt(doubt, mesh: VirtualMesh, solved: np.ndarray, branch: int, solve, unit_per_scene, camera, box) -> None:
+def _add_doubt(
+    doubt, mesh: VirtualMesh, vertices: VertexView, solved: np.ndarray, branch: int, solve, unit_per_scene, camera, box
+) -> None:
     """Mark the pixels at which the missing part of a triangle may appear that lacks the branch at one or two corners.
 
     Towards a fold of the caustic the picture of a corner comes to meet its picture in a branch of the next index: the
@@ -524,7 +566,19 @@ def _add_doubt(doubt, mesh: VirtualMesh, solved: np.ndarray, branch: int, solve,
             gap = np.where(there, np.maximum(gap, apart), gap)
     p = points[triangle].astype(np.float64)
     longest = np.linalg.norm(p - p[:, [1, 2, 0]], axis=2).max(axis=1) * unit_per_scene
+    # Where the picture moves like the root of the distance to the fold, which lies within the next edge, it moves by at most
+    # 1 / (sqrt(2) - 1) of the edge before.
+    edge = mesh.host_triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    edge = edge[solved[edge].all(axis=1)]
+    screen = vertices.screen.numpy()[..., :3]
+    edge = edge[(screen[edge][..., 2] > 0.0).all(axis=1)]
+    step = np.linalg.norm(screen[edge[:, 0], :2] - screen[edge[:, 1], :2], axis=1)
+    before = np.zeros(mesh.vertex_count)
+    for end in (0, 1):
+        np.maximum.at(before, edge[:, end], step)
+    before = np.where(before > 0.0, FOLD_STEP * before, np.inf)[triangle]
     straight = FOLD_REACH * longest[:, None] * answers[branch].drift.numpy()[place] * max(camera.fx, camera.fy)
+    straight = np.minimum(straight, before)
     reach = np.where(gap[place] > 0.0, np.minimum(gap[place], straight), straight) + 1.0
     use = corner[partly] & (own[place][..., 2] > 0.0)
     x, y, r = own[place][..., 0][use], own[place][..., 1][use], reach[use]

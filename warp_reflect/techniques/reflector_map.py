@@ -23,7 +23,7 @@ from warp_reflect.reflector_maps import ReflectorMap, ReflectorMapView
 from warp_reflect.scene import PartRange, Scene
 from warp_reflect.segments import EDGE_SINE_MAX, Segmentation, part_mesh, segment
 from warp_reflect.settings import Settings, Technique
-from warp_reflect.techniques import baking, forward, grid, pieces, planar
+from warp_reflect.techniques import baking, forward, grid, pieces, planar, sheet_branches
 from warp_reflect.techniques.map_search import SearchSettings, is_visible, search_settings, solve_vertex
 from warp_reflect.techniques.pieces import Piece
 from warp_reflect.techniques.vertices import SolveFrame, VertexView, vertices_from
@@ -208,8 +208,10 @@ def _prepare_pieces(scene: Scene, reflector: Reflector, settings: Settings) -> P
         )
         drawn = baking.baked_or_drawn(scene, part, faces[members], settings.map_resolution, draw)
         total += drawn.bytes
-        prepared = Prepared(numbered, drawn, drawn.unit_from_body)
-        found.append(Piece(own, sys.modules[__name__], prepared, _Side(sheet_of.sheet.centre)))
+        centre, other = sheet_of.sheet.centre, replace(numbered, id=len(found) + 2)
+        outside = Piece(own, sys.modules[__name__], Prepared(numbered, drawn, drawn.unit_from_body), _Side(centre, 1))
+        inside = Piece(own, sheet_branches, sheet_branches.Prepared(other, drawn, -1), _Side(centre, -1))
+        found += [outside, inside]
     return PreparedPieces(reflector, found, total)
 
 
@@ -229,12 +231,13 @@ def _mean_plane(corner: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
 
 @dataclass(frozen=True)
 class _Side:
-    """Which pixels see a sheet from outside its convex body: normals on the eye's side point away from the centre."""
+    """Which pixels see a sheet from outside (1) or inside (-1) its body: normals on the eye's side and the centre tell."""
 
     centre: np.ndarray
+    side: int
 
     def __call__(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        return np.einsum("ij,ij->i", normals, points - self.centre) > 0.0
+        return self.side * np.einsum("ij,ij->i", normals, points - self.centre) > 0.0
 
 
 @dataclass(frozen=True)
