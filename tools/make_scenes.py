@@ -402,8 +402,6 @@ SCENES = {
         _open_bowl,
         "An open double-sided bowl: half an ellipsoid, from outside and from within",
         ("/World/Bowl",),
-        techniques=("quadric", "raytraced"),
-        allowed=("reflector_map",),
     ),
     "mesh_kettle": Recipe(
         _mesh_kettle,

@@ -285,21 +285,17 @@ CURVED_SCENES = {
         _shaving_mirror,
         "A concave spherical cap: near things upright and large, far ones upside down",
         ("/World/Mirror",),
-        techniques=("quadric", "raytraced"),
-        allowed=("reflector_map",),
     ),
     "torus": Recipe(
         _torus,
         "A torus among coloured things: saddles and a hole, and it sees itself",
         ("/World/Torus",),
-        techniques=("raytraced",),
-        allowed=("reflector_map",),
+        techniques=("reflector_map", "raytraced"),
     ),
     "car_body": Recipe(
         _car_body,
         "A car body as one subdivided mesh, neither convex nor star-shaped",
         ("/World/Car/Body",),
-        techniques=("raytraced",),
-        allowed=("reflector_map",),
+        techniques=("reflector_map", "raytraced"),
     ),
 }
