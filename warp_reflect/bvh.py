@@ -378,7 +378,8 @@ class Tracer:
     """
 
     def __init__(self, scene: Scene, part: int | None = None):
-        self.scene = scene
+        # Not the scene itself, which owns this: the pair would wait for the garbage collector, a scene a frame.
+        self._device, self._view = scene.device, scene.view
         self._mesh = None
         triangles = scene.host_triangles
         if part is not None:
@@ -411,14 +412,14 @@ class Tracer:
             (triangle int32 [n], -1 none; t float32 [n]; u, v float32 [n], the weights of the second and third
             corner).
         """
-        device = self.scene.device
+        device = self._device
         origins = _vectors(origins, device)
         directions = _vectors(directions, device)
         n = len(origins)
         triangle = wp.full(n, -1, dtype=int, device=device)
         t, u, v = (wp.zeros(n, dtype=float, device=device) for _ in range(3))
         if self._mesh is not None:
-            inputs = [wp.uint64(self.id), self.scene.view, origins, directions, triangle, t, u, v]
+            inputs = [wp.uint64(self.id), self._view, origins, directions, triangle, t, u, v]
             launch.launch(trace_kernel, n, inputs, device, threads)
         return triangle, t, u, v
 
