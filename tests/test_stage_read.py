@@ -1,5 +1,7 @@
 """Stages to arrays: geometry, attributes, transforms, instances, materials, cameras, lights, bad prims."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 import stage_samples as samples
@@ -56,6 +58,36 @@ def test_mesh_of_mixed_faces(stage):
     area = 0.5 * np.cross(b - a, c - a)[:, 2]
     assert (area > 0.0).all() and area.sum() == pytest.approx(2.5 + 1.0)
     assert mesh.normals is None and not texts(data)
+
+
+@pytest.mark.parametrize(("corners", "scheme"), [(3, "none"), (4, "none"), (3, "catmullClark")])
+def test_large_meshes_take_a_small_multiple_of_their_arrays(stage, corners, scheme):
+    """Blocks keep what is made on the way small; the library's own arrays are not counted here."""
+    n = 401
+    u, v = np.meshgrid(np.linspace(0, 6, n), np.linspace(0, 6, n))
+    points = np.stack([u, v, 0.1 * np.sin(u) * np.sin(v)], axis=-1).reshape(-1, 3).astype(np.float32)
+    grid = np.arange(n * n, dtype=np.int32).reshape(n, n)
+    faces = np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]], axis=-1).reshape(-1, 4)
+    if corners == 3:
+        faces = faces[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3)
+    mesh = UsdGeom.Mesh.Define(stage, "/Mesh")
+    mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
+    mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), corners, np.int32)))
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces.reshape(-1)))
+    mesh.CreateSubdivisionSchemeAttr(scheme)
+    reader = StageReader(samples.saved(stage))
+    tracemalloc.start()
+    data = reader.read()
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    found = data.meshes[0]
+    assert len(found.triangles) == 2 * (n - 1) ** 2
+    arrays = [found.points, found.triangles, found.normals, found.normal_index]
+    assert peak < 6 * sum(each.nbytes for each in arrays if each is not None)
+    # Every triangle of the height field faces up, with the area of its square's half below it.
+    side = found.points[found.triangles[:, 1:]] - found.points[found.triangles[:, :1]]
+    area = np.cross(side[:, 0].astype(float), side[:, 1].astype(float))[:, 2]
+    assert area.sum() == pytest.approx(2 * 36.0, rel=1e-5) and (area > 0.0).all()
 
 
 def test_holes_are_not_drawn(stage):

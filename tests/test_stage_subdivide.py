@@ -209,7 +209,8 @@ def test_degenerate_cages_give_finite_surfaces():
         (6, True, 100.0, 4),
         (1000, True, 200.0, 1),
         (1000, True, 400.0, 2),
-        (1_000_000, True, 500.0, 1),
+        (100_000, True, 500.0, 1),
+        (1_000_000, True, 500.0, 0),
     ],
 )
 def test_level_follows_role_and_size(faces, mirror, pixels, level):

@@ -11,14 +11,15 @@ MIRROR_EDGE_PIXELS = 6.0  # facets of a mirror are cut to about this; limit norm
 MIRROR_LEVEL_MAX = 4
 SMALL_PIXELS = 32.0  # what is smaller on screen is drawn as its cage
 FINE_EDGE_PIXELS = 3.0  # so is a cage that is this dense: production meshes of 10^5 faces
+MIRROR_FINE_EDGE_PIXELS = 2.0  # likewise of a mirror: 10^6 faces, whose own normals are as good as the limit's
 
 
 def subdivision_level(face_count: int, is_mirror: bool, pixels: float) -> int:
     """The level of a subdivision surface where no complexity is asked for.
 
-    Mirrors are refined until an edge spans about `MIRROR_EDGE_PIXELS`, at least once and at most
-    `MIRROR_LEVEL_MAX` times; everything else once if it is larger than `SMALL_PIXELS` and its edges span more
-    than `FINE_EDGE_PIXELS`, else not at all.
+    Mirrors are refined until an edge spans about `MIRROR_EDGE_PIXELS`, at most `MIRROR_LEVEL_MAX` times and at least
+    once, unless their edges span `MIRROR_FINE_EDGE_PIXELS` at most; everything else once if it is larger than
+    `SMALL_PIXELS` and its edges span more than `FINE_EDGE_PIXELS`, else not at all.
 
     Args:
         face_count: Faces of the cage.
@@ -30,7 +31,7 @@ def subdivision_level(face_count: int, is_mirror: bool, pixels: float) -> int:
     if not is_mirror:
         return 1 if pixels > SMALL_PIXELS and edge > FINE_EDGE_PIXELS else 0
     if edge <= MIRROR_EDGE_PIXELS:
-        return 1 if pixels > SMALL_PIXELS else 0
+        return 1 if pixels > SMALL_PIXELS and edge > MIRROR_FINE_EDGE_PIXELS else 0
     if not np.isfinite(edge):
         return MIRROR_LEVEL_MAX
     return int(np.clip(np.ceil(np.log2(edge / MIRROR_EDGE_PIXELS)), 1, MIRROR_LEVEL_MAX))

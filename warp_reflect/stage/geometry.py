@@ -183,10 +183,15 @@ def _point_normals(surface: _Surface) -> CornerAttribute:
         indices = surface.indices[corner : corner + int(counts.sum())]
         drawn = surface.drawn[first : first + BLOCK]
         corner += len(indices)
-        if (counts == 3).all():
-            triangles = indices.reshape(-1, 3)[drawn]
-            a, b, c = (surface.points[triangles[:, k]] for k in range(3))
-            at, turn = triangles.reshape(-1), np.repeat(np.cross(b - a, c - a), 3, axis=0)
+        size = int(counts[0])
+        if (counts == size).all():
+            faces = indices.reshape(-1, size)[drawn]
+            p = surface.points[faces]
+            if size == 3:  # the same at its three corners
+                turn = np.repeat(np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]), 3, axis=0)
+            else:
+                turn = np.cross(np.roll(p, -1, axis=1) - p, np.roll(p, 1, axis=1) - p).reshape(-1, 3)
+            at = faces.reshape(-1)
         else:
             starts = np.cumsum(counts) - counts
             face_of = np.repeat(np.arange(len(counts)), counts)
