@@ -19,12 +19,15 @@ CURVED_SHARE = 2.0  # virtual vertices and triangles per one of the scene, where
 
 
 def predict(
-    scene: Scene, technique: str, pixels: int, settings: Settings, branches: bool = False
+    scene: Scene, technique: str, pixels: int, settings: Settings, branches: bool = False, passes: int = 1, held: float = 1.0
 ) -> dict[str, float]:
     """Predicted `error_px`, `ms` per frame and prepared `bytes` of a reflector.
 
     Args:
-        branches: The mirror is seen from within, and every vertex may appear several times (`quadric` alone).
+        branches: The mirror is seen from within, and every vertex may appear several times (`quadric` and
+            `reflector_map`).
+        passes: How often every vertex is reflected: once for every sheet of a mirror.
+        held: Share of the mirror that the technique holds; the rest is traced, and the mirror may see itself.
     """
     threads = thread_count(scene.device, settings.threads)
     traced = pixels * TRACE_US
@@ -33,11 +36,14 @@ def predict(
     forward = scene.vertex_count * SEARCH_US + scene.triangle_count * RASTER_US
     if technique != "planar":
         forward *= CURVED_SHARE
+    forward *= passes
+    if held < 1.0 or passes > 1:
+        forward += pixels * ((1.0 - held) * TRACE_US + OWN_BODY_US)
     if branches:
         forward += scene.vertex_count * BRANCHES_US + pixels * OWN_BODY_US
     if settings.refine == "exact":
         forward += pixels * (REFINE_US + DOUBT_SHARE * TRACE_US)
-    bytes_ = 6 * settings.map_resolution**2 * 32 if technique == "reflector_map" else 0
+    bytes_ = passes * 6 * settings.map_resolution**2 * 32 if technique == "reflector_map" else 0
     # Straight virtual edges between exact vertices: the papers' picture is wrong by about a pixel at silhouettes.
     error = 0.0 if settings.refine == "exact" else 1.0
     return {"error_px": error, "ms": 1e-3 * forward / threads, "bytes": bytes_}

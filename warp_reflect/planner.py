@@ -244,7 +244,7 @@ def _row(scene, camera, settings, method, number, part_index, part, weight, pixe
     technique, forced, reason = _technique(scene, reflector, camera, method, pixels, settings, part, notes)
     if method == "reference":
         settings = settings.replace(refine="off")
-    predicted = budget.predict(scene, technique, pixels, settings, _branches(scene, reflector, camera, technique))
+    predicted = budget.predict(scene, technique, pixels, settings, *_work(scene, reflector, camera, technique))
     return PlanRow(
         reflector,
         part.prim_path,
@@ -283,7 +283,7 @@ def _technique(scene, reflector, camera, method, pixels, settings, part, notes) 
         if not applies:
             reasons.append(f"{name}: {reason}")
             continue
-        forward = budget.predict(scene, name, pixels, settings, _branches(scene, reflector, camera, name))["ms"]
+        forward = budget.predict(scene, name, pixels, settings, *_work(scene, reflector, camera, name))["ms"]
         traced = budget.predict(scene, "raytraced", pixels, settings)["ms"]
         if traced < forward:
             return (
@@ -296,8 +296,12 @@ def _technique(scene, reflector, camera, method, pixels, settings, part, notes) 
     return "raytraced", False, "; ".join(reasons)
 
 
-def _branches(scene, reflector, camera: Camera, technique: str) -> bool:
-    return technique == "quadric" and TECHNIQUES[technique].has_branches(scene, reflector, camera)
+def _work(scene, reflector, camera: Camera, technique: str) -> tuple[bool, int, float]:
+    """`budget.predict`'s branches, passes and held."""
+    module = TECHNIQUES[technique]
+    branches = technique in ("quadric", "reflector_map") and module.has_branches(scene, reflector, camera)
+    passes, held = module.extent(scene, reflector) if technique == "reflector_map" else (1, 1.0)
+    return branches, passes, held
 
 
 def _applies(scene, reflector, camera: Camera, method: str) -> tuple[bool, str]:

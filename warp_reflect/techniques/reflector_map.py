@@ -126,9 +126,30 @@ def applies(scene: Scene, reflector: Reflector) -> tuple[bool, str]:
     return True, str(segmentation)
 
 
-def passes(scene: Scene, reflector: Reflector) -> int:
-    """How often a frame reflects every vertex of the scene."""
-    return 1 if _one_map(scene, reflector.part) else len(scene_segments(scene, reflector.part).segments)
+def extent(scene: Scene, reflector: Reflector) -> tuple[int, float]:
+    """(how often a frame reflects every vertex of the scene, share of the mirror that its maps hold)."""
+    if _one_map(scene, reflector.part):
+        return 1, 1.0
+    segmentation = scene_segments(scene, reflector.part)
+    return max(len(segmentation.segments), 1), segmentation.held
+
+
+def has_branches(scene: Scene, reflector: Reflector, camera: Camera) -> bool:
+    """Whether the eye sees the hollow side of a sheet, on which every vertex may appear several times."""
+    if _one_map(scene, reflector.part):
+        return False
+    points, faces, _ = part_mesh(scene, scene.parts[reflector.part])
+    closed = scene.body(reflector.part).closed
+    eye = camera.eye - scene.origin
+    for sheet in scene_segments(scene, reflector.part).segments:
+        corner = points[faces[sheet.triangles]].astype(np.float64)
+        facing = np.einsum(
+            "ij,ij->i", np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), eye - corner[:, 0]
+        )
+        front, back = (facing > 0.0).any(), (facing < 0.0).any() and not closed
+        if (sheet.kind == "concave" and front) or (sheet.kind == "convex" and back):
+            return True
+    return False
 
 
 def scene_segments(scene: Scene, part: int) -> Segmentation:
