@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import itertools
 import json
 import os
@@ -9,6 +10,7 @@ import shutil
 import signal
 import sys
 import threading
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -479,6 +481,23 @@ def test_still_stage_is_read_once(stage, device, monkeypatch):
     monkeypatch.setattr(read.StageReader, "_read", lambda *_: pytest.fail("read again"))
     assert scene.at(2.0).shares_world(scene)
     assert scene.at(2.0).data.time == 2.0
+
+
+@pytest.mark.parametrize("method", ["auto", "reference", "reflector_map"])
+def test_nothing_of_a_frame_waits_for_the_garbage_collector(stage, device, method):
+    first = wr.load_stage(stage, device, 1.0)
+    gc.disable()
+    try:
+        scene = first.at(2.0)
+        plan = wr.make_plan(scene, size=(40, 30), method=method)
+        frame = wr.render_frame(scene, plan)
+        for name in frame.keys():
+            assert frame[name].size
+        kept = [weakref.ref(each) for each in (frame, plan, scene)]
+        del frame, plan, scene
+        assert [each() for each in kept] == [None, None, None]
+    finally:
+        gc.enable()
 
 
 def resident_bytes() -> int:
