@@ -44,7 +44,7 @@ wp.set_module_options({"enable_backward": False})
 START_SHARE = 0.02  # nodes per vertex of the level a frame starts from: it costs little and is rarely good enough
 ROUNDS_MAX = 16
 ROUND_WORTH = 400  # vertices: solving fewer costs less than the launches of another round
-NODES_MAX = 0.5  # nodes per vertex: more save nothing
+NODES_MAX = 0.15  # nodes per vertex that `max_error_px` may solve: where it asks for more, the grid saves little
 BUDGET_ROUNDS = 2  # descents by `grid_share`: the second sees better estimates
 NODES_PER_CELL = 2.5  # of a surface's cells, shared corners counted in parts
 STRADDLING_COUNT = 16.0  # vertices of a cell at the hidden boundary below which nodes cost more than they save
@@ -364,11 +364,10 @@ def interpolated_reach(node: VertexView, chunks: ChunkView, cell: int) -> float:
 
 
 @wp.func
-def settle(out_vertex: VertexView, vertex: int, camera: CameraView, q: wp.vec3, seed: wp.vec3, reach: float):
+def settle(out_vertex: VertexView, vertex: int, camera: CameraView, q: wp.vec3, reach: float):
     """Write an interpolated virtual vertex (eye frame)."""
     out_vertex.status[vertex] = wp.uint8(CONVERGED)
     out_vertex.reach[vertex] = reach
-    out_vertex.seed[vertex] = project_to_cube(seed)
     out_vertex.screen[vertex] = project(camera, q)
     if out_vertex.position.shape[0] > 0:
         out_vertex.position[vertex] = q
@@ -384,7 +383,7 @@ def position_kernel(
     camera: CameraView,
     out_vertex: VertexView,
 ):
-    """One thread per chunk: virtual positions from the cell's corners; seeds too, for whoever searches from here."""
+    """One thread per chunk: virtual positions from the cell's corners."""
     i = first + wp.tid()
     cell = chunks.cell[i]
     begin = chunks.range[i][0]
@@ -397,12 +396,11 @@ def position_kernel(
         return
     low = chunks.low[cell]
     position = trilinear(node.position, chunks.corner, cell)
-    seed = trilinear(node.seed, chunks.corner, cell)
     reach = interpolated_reach(node, chunks, cell)
     for j in range(begin, end):
         if int(out_vertex.status[order[j]]) == 0:
             local = (points[j] - low) * inv
-            settle(out_vertex, order[j], camera, evaluate(position, local), evaluate(seed, local), reach)
+            settle(out_vertex, order[j], camera, evaluate(position, local), reach)
 
 
 @wp.kernel
@@ -482,14 +480,13 @@ def slope_position_kernel(
         column(m6, 2),
         column(m7, 2),
     )
-    seed = trilinear(node.seed, chunks.corner, cell)
     reach = interpolated_reach(node, chunks, cell)
     for j in range(begin, end):
         if int(out_vertex.status[order[j]]) == 0:
             local = (points[j] - low) * inv
             q = evaluate(position, local) + local[0] * evaluate(along_x, local)
             q += local[1] * evaluate(along_y, local) + local[2] * evaluate(along_z, local)
-            settle(out_vertex, order[j], camera, q, evaluate(seed, local), reach)
+            settle(out_vertex, order[j], camera, q, reach)
 
 
 @wp.kernel
@@ -543,7 +540,8 @@ def direction_kernel(
                 if r.residual < ACCEPTED and left < tolerance:
                     out_failed[j] = wp.uint8(0)
                     out_vertex.residual[vertex] = r.residual
-                    settle(out_vertex, vertex, camera, virtual_vertex(frame, r.p, r.n, target), x, reach)
+                    out_vertex.seed[vertex] = x
+                    settle(out_vertex, vertex, camera, virtual_vertex(frame, r.p, r.n, target), reach)
 
 
 @wp.kernel
@@ -638,7 +636,8 @@ def fill(
     tree = cells.tree
     failed = _interpolate(scene, cells, descent, interpolated, map, frame, view, camera, settings, out_vertex)
     places = np.concatenate([_ranges(tree.first[exact], tree.count[exact]), failed]).astype(np.int32)
-    places = places[np.diff(descent.waiting_before)[places] > 0]
+    if descent.waiting_before is not None:
+        places = places[np.diff(descent.waiting_before)[places] > 0]
     if len(places):
         listed = wp.array(places, dtype=int, device=scene.device)
         points = wp.empty(len(places), dtype=wp.vec3, device=scene.device)
@@ -649,7 +648,7 @@ def fill(
         launch(scatter_kernel, len(places), [cells.order, listed, solved, out_vertex], scene.device, settings.threads)
     levels = np.unique(tree.level[interpolated])
     return {
-        "grid_vertices": int(descent.waiting_before[-1]),
+        "grid_vertices": len(cells.vertices) if descent.waiting_before is None else int(descent.waiting_before[-1]),
         "grid_nodes": descent.node_count,
         "grid_exact": len(places),
         "grid_levels": len(levels),
@@ -662,12 +661,15 @@ class _Descent:
     def __init__(self, scene, cells, solve, frame, map, camera, box, settings, out_vertex):
         self.scene, self.cells, self.solve, self.frame, self.settings = scene, cells, solve, frame, settings
         tree = cells.tree
-        waiting = out_vertex.status.numpy()[cells.vertices] == 0
-        self.waiting_before = np.r_[0, np.cumsum(waiting)]
+        status = out_vertex.status.numpy()
+        self.waiting_before = None  # of vertices in the grid's order; None: all of them
+        if status.any():
+            self.waiting_before = np.r_[0, np.cumsum(status[cells.vertices] == 0)]
         self.slot = np.full(len(tree.nodes), -1, np.int32)
         self.node_count = 0
         # More nodes than this are not solved: the rest is exact.
-        self.capacity = min(len(tree.nodes), int(NODES_MAX * len(cells.vertices)) + len(cells.start) * CORNER_COUNT)
+        share = max(NODES_MAX, 1.5 * settings.grid_share)
+        self.capacity = min(len(tree.nodes), int(share * len(cells.vertices)) + len(cells.start) * CORNER_COUNT)
         self.node = empty_vertices(self.capacity, scene.device, with_position=True)
         self.slope = wp.empty(
             self.capacity if settings.grid_kind == "slope" else 0, dtype=wp.mat33, device=scene.device
@@ -687,6 +689,8 @@ class _Descent:
 
     def waiting(self, cell) -> np.ndarray:
         """Vertices of cells that have no answer yet."""
+        if self.waiting_before is None:
+            return self.cells.tree.count[cell]
         first = self.cells.tree.first[cell]
         return self.waiting_before[first + self.cells.tree.count[cell]] - self.waiting_before[first]
 
