@@ -74,6 +74,7 @@ class BranchView:
     tangent_y: wp.array(dtype=wp.vec3)
     slope: wp.array(dtype=wp.vec3)  # (tangent_x . o, tangent_y . o, 1 where the eye meets the quadric)
     normal: wp.array(dtype=wp.vec3)
+    bounds: wp.vec4  # of the lattice: x0, y0, x1, y1 [pixels]
 
 
 @wp.struct
@@ -187,8 +188,13 @@ def search_branches_kernel(
     # A point close to the mirror is seen beside its foot, where the lattice's cells are too coarse.
     near = polish(view, frame.eye, target, target)
     if near.valid != 0 and near.index == 0:
-        shortest_0 = near.length
-        write_root(frame, camera, near, target, i, out_upright)
+        shown = project(camera, frame.eye_from_unit * (near.point - frame.eye))
+        bounds = view.bounds
+        # Beside the lattice it would be the one corner of its triangles that is known.
+        inside = shown[0] > bounds[0] and shown[0] < bounds[2] and shown[1] > bounds[1] and shown[1] < bounds[3]
+        if inside and shown[2] > 0.0:
+            shortest_0 = near.length
+            write_root(frame, camera, near, target, i, out_upright)
     above_x = _row()
     above_y = _row()
     y = int(0)
@@ -331,6 +337,7 @@ def lattice(scene: Scene, prepared: Prepared, camera: Camera, box: tuple[int, in
     view.a = wp.vec3(*a)
     view.b = float(b)
     view.c = float(c)
+    view.bounds = wp.vec4(x.min(), y.min(), x.max(), y.max())
     for name, rows in zip(("point", "tangent_x", "tangent_y", "slope", "normal"), (p, *tangent, slope, n), strict=True):
         setattr(view, name, wp.array(rows.astype(np.float32), dtype=wp.vec3, device=scene.device))
     return view
