@@ -360,6 +360,95 @@ def test_frame_names_take_every_common_pattern():
     assert not has_frame_pattern("a.exr")
 
 
+# Render settings of the stage.
+
+SETTINGS = """
+def Scope "Render"
+{
+    def RenderSettings "Draft"
+    {
+        rel camera = </World/Second>
+        rel products = [</Render/Beauty>, </Render/Deep>]
+        uniform int2 resolution = (40, 20)
+    }
+    def RenderProduct "Beauty"
+    {
+        uniform int2 resolution = (32, 24)
+        rel orderedVars = [</Render/color>, </Render/Depth>, </Render/pathLength>, </Render/albedo>]
+        token productName = "beauty.exr"
+    }
+    def RenderProduct "Deep"
+    {
+        uniform token productType = "deepRaster"
+        token productName = "deep.exr"
+    }
+    def RenderVar "color"
+    {
+    }
+    def RenderVar "Depth"
+    {
+        uniform string sourceName = "depth"
+    }
+    def RenderVar "pathLength"
+    {
+    }
+    def RenderVar "albedo"
+    {
+    }
+    def RenderSettings "Bare"
+    {
+    }
+}
+"""
+SECOND_CAMERA = STAGE[STAGE.index('    def Camera "Camera"') : STAGE.index('    def Sphere "Mirror"')]
+
+
+@pytest.fixture
+def settings_stage(stage) -> str:
+    """The stage with a second, farther camera and render settings."""
+    second = SECOND_CAMERA.replace('"Camera"', '"Second"').replace("(0, 1, 8)", "(0, 1, 9)")
+    Path("asking.usda").write_text(
+        STAGE.replace('    def Sphere "Mirror"', second + '    def Sphere "Mirror"') + SETTINGS
+    )
+    return "asking.usda"
+
+
+def test_render_settings_give_size_camera_name_and_channels(settings_stage, call):
+    code, out, err = call("render", settings_stage, "--render-settings", "Draft")
+    assert code == 0
+    assert out.startswith("beauty.exr: 32x24")  # the product stands over its settings
+    channels, header = images.read_exr("beauty.exr")
+    assert set(channels) == {"R", "G", "B", "A", "Z", "pathLength"}
+    assert header["warp_reflect:eye"] == [0.0, 1.0, 9.0]
+    assert err.splitlines() == [
+        "note: /Render/Deep: a product of type deepRaster is not rendered",
+        "note: /Render/albedo: no channel is called 'albedo'",
+    ]
+
+
+def test_command_stands_over_the_render_settings_of_the_stage(settings_stage, call):
+    text = Path(settings_stage).read_text()
+    Path(settings_stage).write_text(text.replace("(\n", '(\n    renderSettingsPrimPath = "/Render/Draft"\n', 1))
+    assert json.loads(call("plan", settings_stage, "--json")[1])["size"] == [32, 24]
+    code, out, _ = call("render", settings_stage, "a.exr", "-w", "20", "-cam", "Camera", "--aov", "status")
+    assert (code, out[:12]) == (0, "a.exr: 20x15")
+    channels, header = images.read_exr("a.exr")
+    assert (set(channels), header["warp_reflect:eye"]) == ({"status"}, [0.0, 1.0, 8.0])
+    assert not Path("beauty.exr").exists()
+    code, out, _ = call("render", settings_stage, "a.exr", "-rs", "/Render/Bare")
+    assert (code, out[:14]) == (0, "a.exr: 960x720")
+
+
+def test_render_settings_that_are_not_there_are_named(settings_stage, call):
+    code, out, err = call("render", settings_stage, "a.exr", "--render-settings", "Final")
+    assert (code, out) == (2, "")
+    assert err == (
+        "error: --render-settings: no RenderSettings prim at '/Render/Final'; the stage has /Render/Draft, /Render/Bare\n"
+    )
+    assert call("render", settings_stage, "a.exr", "-rs", "Draft", "--untrusted")[0] == 2
+    assert call("render", settings_stage, "a.exr", "-w", "20", "--untrusted")[0] == 0
+
+
 # The kernel cache.
 
 

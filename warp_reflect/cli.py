@@ -21,6 +21,7 @@ from warp_reflect.devices import open_device as _open_device
 from warp_reflect.pipeline import DONE, IMPOSSIBLE, PART_WAY, SIDE_MAX, Job, one_line, plan_scene
 from warp_reflect.progress import reporting
 
+WIDTH_DEFAULT = 960  # pixels; usdrecord's
 INTERRUPTED = 130  # what a shell expects of a process that SIGINT ended
 
 # What a user's input can cause; anything else is a fault of this program.
@@ -55,8 +56,8 @@ class PlanOptions:
 
     camera: Annotated[str | None, Parameter(name=["--camera", "-cam"])] = None
     """Path or name of a camera."""
-    image_width: Annotated[int, Parameter(name=["--imageWidth", "-w"])] = 960
-    """Width in pixels; the height follows from the camera's aspect."""
+    image_width: Annotated[int | None, Parameter(name=["--imageWidth", "-w"])] = None
+    """Width in pixels (960); the height follows from the camera's aspect."""
     res: str | None = None
     """Exact size instead, WIDTHxHEIGHT."""
     method: str = "auto"
@@ -69,6 +70,11 @@ class PlanOptions:
     """A setting, name=value; repeatable."""
     complexity: Annotated[str | None, Parameter(name=["--complexity", "-c"])] = None
     """low, medium, high or veryhigh: how finely surfaces are tessellated."""
+    render_settings: Annotated[str | None, Parameter(name=["--render-settings", "--renderSettingsPrimPath", "-rs"])] = (
+        None
+    )
+    """A RenderSettings prim to take size, camera, outputs and channels from, as far as this command does not name them
+    (default: the stage's renderSettingsPrimPath)."""
 
 
 @app.command
@@ -92,6 +98,7 @@ def plan(
     settings = _settings(planned)
     _check_method(planned.method)
     _check_size_options(planned)
+    _, _, planned, notes = _as_the_stage_asks(stage, [], None, opened, planned)
     device = _open_device(opened.device)
     with reporting(None) as report:
         report.busy("reading " + stage)
@@ -99,7 +106,7 @@ def plan(
         report.busy("planning")
         made = _make_plan(scene, planned, settings)
     print(json.dumps(made.to_json(), indent=2, allow_nan=False) if json_ else made)
-    report.notes([*scene.notes, *made.notes])
+    report.notes([*notes, *scene.notes, *made.notes])
     return DONE
 
 
@@ -153,14 +160,17 @@ def render(
         ranged: How a range of frames is rendered.
     """
     opened, planned, ranged = opened or StageOptions(), planned or PlanOptions(), ranged or RangeOptions()
-    part = _part(ranged.part)
-    if ranged.workers < 1:
-        raise ValueError(f"--workers: got {ranged.workers}, expected 1 or more")
-    job = _job(stage, [*outputs, *(output or [])], frames, aov, opened, planned, ranged)
-    if ranged.print_job is not None:
-        return _print_job(ranged.print_job, job, [*outputs, *(output or [])], frames, aov, opened, planned, ranged)
+    names = [*outputs, *(output or [])]
     with reporting(ranged.progress) as report:
         try:
+            part = _part(ranged.part)
+            if ranged.workers < 1:
+                raise ValueError(f"--workers: got {ranged.workers}, expected 1 or more")
+            names, channels, wanted, notes = _as_the_stage_asks(stage, names, aov, opened, planned)
+            job = _job(stage, names, frames, channels, opened, wanted, ranged)
+            if ranged.print_job is not None:
+                return _print_job(ranged.print_job, job, names, frames, aov, opened, planned, ranged)
+            report.notes(notes)
             job = replace(job, load=job.load | {"device": _open_device(opened.device)})
             return pipeline.run(
                 job,
@@ -180,6 +190,26 @@ def render(
                 report.line(traceback.format_exc())
             report.line(f"error: {one_line(error)}")
             return IMPOSSIBLE
+
+
+def _as_the_stage_asks(stage: str, names: list[str], aov: str | None, opened: StageOptions, planned: PlanOptions):
+    """(outputs, channels, options, notes) with what a RenderSettings prim says wherever the command says nothing."""
+    if opened.untrusted:
+        if planned.render_settings is not None:
+            raise ValueError("--render-settings: not read from an untrusted stage; give --camera, --res and --aov")
+        return names, aov, planned, []
+    from warp_reflect.stage.render_settings import read_render_settings
+
+    spec = read_render_settings(stage, planned.render_settings, opened.root or "")
+    if spec is None:
+        return names, aov, planned, []
+    if planned.res is None and planned.image_width is None and spec.resolution is not None:
+        planned = replace(planned, res="{}x{}".format(*spec.resolution))
+    if planned.camera is None and spec.camera:
+        planned = replace(planned, camera=spec.camera)
+    if aov is None and spec.channels:
+        aov = ",".join(spec.channels)
+    return names or list(spec.outputs), aov, planned, list(spec.notes)
 
 
 def _job(stage, names, frames, aov, opened: StageOptions, planned: PlanOptions, ranged: RangeOptions):
@@ -209,7 +239,7 @@ def _job(stage, names, frames, aov, opened: StageOptions, planned: PlanOptions, 
         files,
         load=_load_options(opened, planned, settings),
         camera=planned.camera,
-        width=planned.image_width,
+        width=planned.image_width or WIDTH_DEFAULT,
         size=_size(planned.res) if planned.res is not None else None,
         settings=settings,
         method=planned.method,
@@ -425,7 +455,7 @@ def _check_method(method: str) -> None:
 
 
 def _check_size_options(planned: PlanOptions) -> None:
-    if not 1 <= planned.image_width <= SIDE_MAX:
+    if planned.image_width is not None and not 1 <= planned.image_width <= SIDE_MAX:
         raise ValueError(f"--imageWidth: got {planned.image_width}, expected 1 to {SIDE_MAX} pixels")
     if planned.res is not None:
         _size(planned.res)
@@ -474,7 +504,8 @@ def _load(stage: str, opened: StageOptions, planned: PlanOptions, settings, devi
 
 def _make_plan(scene, planned: PlanOptions, settings):
     size = _size(planned.res) if planned.res is not None else None
-    return plan_scene(scene, planned.camera, planned.image_width, size, settings, planned.method)
+    width = planned.image_width or WIDTH_DEFAULT
+    return plan_scene(scene, planned.camera, width, size, settings, planned.method)
 
 
 if __name__ == "__main__":
