@@ -8,6 +8,7 @@ import json
 import os
 import shutil
 import signal
+import subprocess
 import sys
 import threading
 import weakref
@@ -23,6 +24,7 @@ from warp_reflect.progress import Report
 from warp_reflect.stage.frames import snapshot_name
 from warp_reflect.stage.identity import stage_digest
 
+ROOT = Path(__file__).resolve().parents[1]
 SMALL = ("-w", "24", "--aov", "RGBA,reflectedPoint,reflectionMotion")
 
 # A chrome sphere, a box that rises from 1 to 9, and the camera, whose place is filled in.
@@ -369,6 +371,31 @@ def test_frame_that_another_process_writes_is_left_to_it(render):
         assert not Path("a.2.exr").exists()
     assert render("a.#.exr", "-f", "1:3", "--resume")[0] == 0
     assert not list(Path().glob(".*"))
+
+
+KILLED = """
+import os, signal, sys
+from warp_reflect import cli, images
+check = images._check_last_rows
+def killed(path, *rest):
+    if path.name == "a.2.exr":
+        os.kill(os.getpid(), signal.SIGKILL)
+    check(path, *rest)
+images._check_last_rows = killed
+cli.main(sys.argv[1:])
+"""
+
+
+def test_what_a_killed_process_left_is_removed_on_resuming(render, stage, device):
+    command = ["render", stage, "a.#.exr", "-f", "1:2", *SMALL, "--device", device]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, "-c", KILLED, *command], env=environment, check=False, capture_output=True)
+    assert done.returncode == -signal.SIGKILL
+    left = {name for name in os.listdir() if name.startswith(".")}
+    assert {Path(name).suffix for name in left} == {".part", ".lock"}
+    assert not Path("a.2.exr").exists()
+    assert names(render("a.#.exr", "-f", "1:2", "--resume")[1]) == ["a.2.exr"]
+    assert sorted(os.listdir()) == ["a.1.exr", "a.2.exr", "look.usda", "stage.usda"]
 
 
 def test_claims_exclude_each_other_and_leave_nothing(tmp_path):

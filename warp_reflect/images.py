@@ -7,6 +7,7 @@ A file appears under its final name whole or not at all.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import stat
@@ -112,7 +113,7 @@ def check_writable(path: str | os.PathLike) -> Path:
     try:
         # A permission bit says little (root, read-only mounts): make a file.
         os.close(os.open(probe, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
-        os.unlink(probe)
+        probe.unlink(missing_ok=True)
     except OSError as error:
         raise OSError(f"{path}: cannot be written: {error.strerror}") from None
     return path
@@ -373,8 +374,20 @@ def _parsed(value):
     return value
 
 
+def remove_parts(path: str | os.PathLike) -> None:
+    """Remove what killed processes left of a file half written; only for who knows that nobody is writing it."""
+    final = Path(os.path.realpath(path))
+    for part in final.parent.glob(f".{_part_mark(final)}-*.part"):
+        part.unlink(missing_ok=True)
+
+
 def _part_name(path: Path) -> Path:
-    return path.parent / f".{os.getpid()}-{next(_part_number)}.part"
+    return path.parent / f".{_part_mark(path)}-{os.getpid()}-{next(_part_number)}.part"
+
+
+def _part_mark(path: Path) -> str:
+    """Stands for a name in the passing names of its file; the name itself may be as long as the system allows."""
+    return hashlib.blake2b(path.name.encode(), digest_size=6).hexdigest()
 
 
 def _write_whole(path: Path, format_name: str, parts: list[tuple]) -> None:

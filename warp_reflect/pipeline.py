@@ -334,6 +334,8 @@ def render_places(
                 elif resume and is_done(job, place, digest):
                     outcome = Outcome(place, "kept")
                 else:
+                    for name in job.files[place] if resume else ():
+                        images.remove_parts(name)
                     if not opened:
                         opened.append(OpenJob(job, place))
                     outcome = _render(opened[0], place, digest)
