@@ -8,6 +8,7 @@ import warp_reflect as wr
 from warp_reflect.scene import CameraData, InstanceData, MaterialData, MeshData, Scene, SceneData
 from warp_reflect.settings import GRID_KINDS, Status
 from warp_reflect.techniques import grid, octree
+from warp_reflect.techniques import vertices as vertices_module
 from warp_reflect.techniques.octree import LEVEL_MAX
 
 
@@ -158,3 +159,25 @@ def test_mirror_among_cells_larger_than_itself_hides_what_it_hides():
     """A small mirror in a large room: cells that it or its shadow might reach into are never interpolated blindly."""
     scene = room(sphere(), placed(0, 0, 1.5, scale=0.1))
     vertex_errors(searched(scene, max_error_px=4.0, grid_kind="slope"), searched(scene))
+
+
+@pytest.mark.parametrize("kind", GRID_KINDS)
+def test_answers_that_are_there_already_are_kept(ball_room, kind):
+    """Vertices that come with a status (culled, or kept from the last frame) are neither solved nor overwritten."""
+    scene = ball_room
+    frame = searched(scene, max_error_px=0.5, grid_kind=kind)
+    prepared = frame.plan.prepared(frame.plan.rows[0])
+    camera = frame.camera
+    solve_frame = vertices_module.solve_frame(scene, camera, prepared.unit_from_scene)
+    for share in (0.5, 1.0):
+        asked = []
+        out = vertices_module.empty_vertices(scene.vertex_count, "cpu")
+        kept = np.random.default_rng(1).random(scene.vertex_count) < share
+        out.status.assign(np.where(kept, int(Status.SKY), 0).astype(np.uint8))
+        statistics = grid.fill(
+            scene, prepared.grid, lambda points, found, asked=asked: asked.append(len(points)), solve_frame, prepared.map,
+            frame.gbuffer.view, camera, (0, 0, *camera.size), frame.plan.settings, out,
+        )  # fmt: skip
+        assert (out.status.numpy()[kept] == int(Status.SKY)).all()
+        assert statistics["grid_vertices"] == (~kept[prepared.grid.vertices]).sum()
+    assert asked == []

@@ -196,14 +196,14 @@ class _Descent:
         done, exact = [], []
         cell = self.cells.start[self.waiting(self.cells.start) > 0]
         error = self._estimate(cell)
-        for step in range(ROUNDS_MAX if by_error else BUDGET_ROUNDS + 1):
+        rounds = ROUNDS_MAX if by_error else BUDGET_ROUNDS
+        for step in range(rounds + 1):
             unsafe = error >= UNSAFE
-            last = not by_error and step == BUDGET_ROUNDS
             tolerance = asked if by_error else self._tolerance(cell, error)
             depth = self._depth(cell, error, tolerance)
             wrong = error > tolerance
             split = wrong & (depth > 0)
-            if last or self.waiting(cell[split]).sum() < ROUND_WORTH:
+            if step == rounds or self.waiting(cell[split]).sum() < ROUND_WORTH:
                 split[:] = False
             direct = (wrong if by_error else unsafe) & ~split
             exact.append(cell[direct])
