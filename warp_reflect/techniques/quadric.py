@@ -14,14 +14,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from warp_reflect.layers import Camera, GBuffer, MirrorPixels, ReflectionLayer, Reflector
-from warp_reflect.mirrors import QuadricMirror
-from warp_reflect.quadric_fit import Fit, fit_quadric
 from warp_reflect.quadrics import FAMILY, CanonicalQuadric, Family, QuadricKind
-from warp_reflect.scene import PartRange, Scene, Shape
+from warp_reflect.scene import Scene
 from warp_reflect.settings import Settings, Technique
 from warp_reflect.techniques import pieces, planar, quadric_branches, quadric_patch
 from warp_reflect.techniques.pieces import Piece
-from warp_reflect.techniques.reflector_map import part_mesh
+from warp_reflect.techniques.quadric_sheets import Sheet, sheets_of
 
 # Pixels. A mesh whose points and normals would shift the picture by more is no quadric; refinement starts from candidates
 # that are off by this, and a pixel next to the right one is a neighbour in all but the finest meshes.
@@ -50,30 +48,23 @@ def applies(scene: Scene, reflector: Reflector, camera: Camera | None = None) ->
     Args:
         camera: The view in whose pixels the residual of a mesh is judged; None: by size.
     """
-    part = scene.parts[reflector.part]
-    shapes = [scene.patch_shapes[k] for k in part.patches]
-    if all(shape is not None for shape in shapes):
-        if all(shape.kind == "plane" for shape in shapes):
-            return False, "no curved patch"
-        names = []
-        for shape in shapes:
-            try:
-                names.append("plane" if shape.kind == "plane" else _name(_canonical(scene, part, shape)))
-            except ValueError as error:
-                return False, f"an analytic patch is no curved surface in the world: {error}"
-        listed = ", ".join(dict.fromkeys(names))
-        reason = f"analytic: {listed}" + (f" ({len(names)} patches)" if len(names) > 1 else "")
-        return True, reason + _branches_text(scene, reflector, camera)
-    if len(shapes) > 1:
-        return False, "some patches are analytic, others are not"
-    fit = _fit(scene, reflector.part)
-    if fit is None:
-        return False, "mesh not recognised: no quadric passes through its points"
-    residual, unit, limit = _residual(scene, reflector.part, fit, camera)
+    sheets = sheets_of(scene, reflector.part)
+    analytic = scene.patch_shapes[scene.parts[reflector.part].patches[0]] is not None
+    strange = [sheet.name for sheet in sheets if not sheet.known]
+    if strange:
+        what = "an analytic patch is no curved surface in the world" if analytic else "mesh not recognised"
+        return False, f"{what}: {strange[0]}"
+    if not any(sheet.quadric for sheet in sheets):
+        return False, "no curved patch" if analytic else "mesh not recognised: it is flat"
+    names = ", ".join(dict.fromkeys(sheet.name for sheet in sheets))
+    count = f" ({len(sheets)} patches)" if len(sheets) > 1 else ""
+    if analytic:
+        return True, f"analytic: {names}{count}" + _branches_text(scene, reflector, camera)
+    residual, unit, limit = _residual(scene, reflector.part, sheets, camera)
     text = f"residual {residual:.2g} {unit} (at most {limit:g})"
     if residual > limit:
-        return False, f"mesh not recognised: nearest is a {fit}, {text}"
-    return True, f"mesh recognised as {fit}, {text}" + _branches_text(scene, reflector, camera)
+        return False, f"mesh not recognised: nearest is {names}{count}, {text}"
+    return True, f"mesh recognised as {names}{count}, {text}" + _branches_text(scene, reflector, camera)
 
 
 def _branches_text(scene: Scene, reflector: Reflector, camera: Camera | None) -> str:
@@ -87,10 +78,13 @@ def has_branches(scene: Scene, reflector: Reflector, camera: Camera) -> bool:
     if reflector.convex:
         return False
     eye = camera.eye - scene.origin
-    for own, quadric in _quadrics(scene, reflector.part):
+    for sheet in sheets_of(scene, reflector.part):
+        quadric = sheet.quadric
+        if quadric is None:
+            continue
         if FAMILY[quadric.kind] == Family.GENERAL:
             return True
-        middle = scene.host_points[scene.host_triangles[own]].astype(np.float64).mean(axis=1)
+        middle = scene.host_points[scene.host_triangles[sheet.triangles]].astype(np.float64).mean(axis=1)
         if (np.einsum("ij,ij->i", quadric_patch.gradients(quadric, middle), eye - middle) < 0.0).any():
             return True
     return False
@@ -98,15 +92,12 @@ def has_branches(scene: Scene, reflector: Reflector, camera: Camera) -> bool:
 
 def prepare(scene: Scene, reflector: Reflector, settings: Settings) -> Prepared:
     """Every patch in its unit frame."""
-    found = [
-        piece for own, quadric in _quadrics(scene, reflector.part) for piece in _sides(scene, reflector, own, quadric)
-    ]
-    for own, shape in _patches(scene, reflector.part):
-        if shape is not None and shape.kind == "plane":
-            point, normal = _plane(scene, scene.parts[reflector.part], shape)
-            size = float(np.ptp(scene.host_points[scene.host_triangles[own]].reshape(-1, 3), axis=0).max()) or 1.0
-            frame = planar.plane_frame(point, normal, size)
-            found.append(Piece(own, planar, planar.Prepared(reflector, frame)))
+    found = []
+    for sheet in sheets_of(scene, reflector.part):
+        if sheet.quadric is not None:
+            found += _sides(scene, reflector, sheet.triangles, sheet.quadric)
+        else:
+            found.append(Piece(sheet.triangles, planar, planar.Prepared(reflector, sheet.plane)))
     return Prepared(reflector, _numbered(found))
 
 
@@ -159,23 +150,6 @@ def _sides(scene: Scene, reflector: Reflector, own: np.ndarray, quadric: Canonic
     return [first, Piece(own, quadric_branches, quadric_branches.prepare_side(reflector, quadric, -1), facing(-1))]
 
 
-def _patches(scene: Scene, part_index: int) -> list[tuple[np.ndarray, Shape | None]]:
-    """(triangles, analytic surface) of a part's patches that have triangles."""
-    part = scene.parts[part_index]
-    own = np.arange(part.first_triangle, part.first_triangle + part.triangle_count)
-    patch = scene.host_triangle_patch[own]
-    return [(own[patch == k], scene.patch_shapes[k]) for k in part.patches if (patch == k).any()]
-
-
-def _quadrics(scene: Scene, part_index: int) -> list[tuple[np.ndarray, CanonicalQuadric]]:
-    """(triangles, quadric) of a part's curved patches; world is the scene frame."""
-    return [
-        (own, _fit(scene, part_index).quadric if shape is None else _canonical(scene, scene.parts[part_index], shape))
-        for own, shape in _patches(scene, part_index)
-        if shape is None or shape.kind != "plane"
-    ]
-
-
 def _towards(quadric: CanonicalQuadric, points: np.ndarray) -> CanonicalQuadric:
     """The quadric turned so that a sheet's points lie at z > 0; a cone, which has no size of its own, gets theirs."""
     if quadric.kind not in (QuadricKind.TWO_SHEETS, QuadricKind.HYPERBOLIC_CYLINDER, QuadricKind.CONE):
@@ -188,41 +162,13 @@ def _towards(quadric: CanonicalQuadric, points: np.ndarray) -> CanonicalQuadric:
     return replace(quadric, axes=axes, size=size)
 
 
-def _canonical(scene: Scene, part: PartRange, shape: Shape) -> CanonicalQuadric:
-    """An analytic patch in its unit principal frame; world is the scene frame."""
-    scene_from_unit = part.world_from_object @ np.linalg.inv(shape.unit_from_object)
-    scene_from_unit[:3, 3] -= scene.origin
-    return QuadricMirror.rotational(shape.a, shape.b, shape.c, scene_from_unit).canonical
-
-
-def _plane(scene: Scene, part: PartRange, shape: Shape) -> tuple[np.ndarray, np.ndarray]:
-    """(point, unit normal) of an analytic plane, scene frame."""
-    scene_from_unit = part.world_from_object @ np.linalg.inv(shape.unit_from_object)
-    normal = np.linalg.inv(scene_from_unit[:3, :3])[2]
-    return scene_from_unit[:3, 3] - scene.origin, normal / np.linalg.norm(normal)
-
-
-def _name(quadric: CanonicalQuadric) -> str:
-    if quadric.kind == QuadricKind.ELLIPSOID and quadric.equal == 3:
-        return "sphere"
-    return quadric.kind.name.lower().replace("_", " ")
-
-
-def _fit(scene: Scene, part_index: int) -> Fit | None:
-    """The quadric nearest to a part; kept with the scene."""
-    if part_index not in scene.fits:
-        points, faces, normals = part_mesh(scene, scene.parts[part_index])
-        scene.fits[part_index] = fit_quadric(points[faces].reshape(-1, 3), normals.reshape(-1, 3))
-    return scene.fits[part_index]
-
-
-def _residual(scene: Scene, part_index: int, fit: Fit, camera: Camera | None) -> tuple[float, str, float]:
-    """(residual, its unit, its limit): how far points and normals off the quadric move what the mirror shows."""
+def _residual(scene: Scene, part_index: int, sheets: list[Sheet], camera: Camera | None) -> tuple[float, str, float]:
+    """(residual, its unit, its limit): how far points and normals off the surfaces move what the mirror shows."""
     part = scene.parts[part_index]
     points = scene.host_points[part.first_vertex : part.first_vertex + part.vertex_count].astype(np.float64)
     size = 0.5 * float(np.linalg.norm(np.ptp(points, axis=0)))
     # A normal off by an angle moves the reflection point by that angle times the radius of curvature, at most the size.
-    shift = fit.distance + fit.sine * size
+    shift = max(sheet.distance + sheet.sine * size for sheet in sheets)
     if camera is None:
         return shift / size, "of its size", RESIDUAL_MAX
     nearest = float(np.linalg.norm(points - (camera.eye - scene.origin), axis=1).min())
