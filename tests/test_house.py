@@ -21,12 +21,12 @@ FILES = {
 # A module imports from its own floor or below. A new module belongs into this table; `x.*` is a folder.
 FLOORS = {
     1: "settings launch devices optics shapes bodies cubemap quadrics quadric_roots quadric_curve quadric_fit heightfield "
-    "images metrics timing",
+    "images metrics timing clipping",
     2: "scene baked_maps segments layers bvh raster shade surface pictures textures normal_maps direct channels stage stage.*",
     3: "solve solver solve_device solve_plane solve_convex solve_map solve_general solve_qim solver_gradients mirrors "
     "reflector_maps techniques techniques.* finishes finishes.*",
-    4: "planner budget bake frame motion sweep",
-    5: "cli viewer viewer.* pipeline progress cluster farm",
+    4: "planner budget bake frame motion virtual_objects seen sweep",
+    5: "cli viewer viewer.* pipeline process progress cluster farm",
 }
 # Where an imported library may appear, inside functions or out.
 HOMES = {

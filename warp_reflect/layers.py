@@ -265,6 +265,7 @@ class ReflectionLayer:
         statistics: Counts of who settled the pixels, and of what the search met.
         timings: Milliseconds per step.
         history: What the next frame may start from.
+        virtual: What a forward technique drew: `virtual_mesh.Drawn` of every piece and branch; empty where rays answered.
     """
 
     pixels: MirrorPixels
@@ -277,6 +278,7 @@ class ReflectionLayer:
     statistics: dict = field(default_factory=dict)
     timings: dict = field(default_factory=dict)
     history: object = None
+    virtual: list = field(default_factory=list)
 
     @classmethod
     def empty(cls, pixels: MirrorPixels, method: int, device) -> ReflectionLayer:

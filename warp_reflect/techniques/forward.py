@@ -35,7 +35,7 @@ from warp_reflect.techniques.vertices import (
     solve_frame,
     vertices_from,
 )
-from warp_reflect.techniques.virtual_mesh import VirtualMesh
+from warp_reflect.techniques.virtual_mesh import Drawn, Straddling, VirtualMesh
 from warp_reflect.timing import StageTimer
 
 wp.set_module_options({"enable_backward": False})
@@ -249,7 +249,11 @@ def reflect(
         if settings.refine == "exact":
             raster.attach_rays(target, gbuffer.view, pixels, settings.threads)
         drawn = raster.rasterise(target, vertices.screen, mesh.triangles, points=mesh.points, threads=settings.threads)
-        clipped, failed = _draw_straddling(scene, mesh, target, frame, vertices, solve_boundary, gbuffer, settings)
+        straddling, failed = _draw_straddling(
+            scene, mesh, target, frame, vertices, solve_boundary, gbuffer, settings
+        )
+        clipped = 0 if straddling is None else len(straddling.boundary) // 2
+        layer.virtual = [Drawn(pixels, mesh, vertices.screen, straddling)]
     if settings.refine == "off":
         with timer("candidates"):
             launch(
@@ -319,8 +323,10 @@ def cut_where_bent(
     return finer, known
 
 
-def _draw_straddling(scene, mesh, target, frame, vertices, solve_boundary, gbuffer, settings) -> tuple[int, int]:
-    """Draw the visible side of triangles that straddle the hidden boundary; (drawn, triangles with a failed corner).
+def _draw_straddling(
+    scene, mesh, target, frame, vertices, solve_boundary, gbuffer, settings
+) -> tuple[Straddling | None, int]:
+    """Draw the visible side of triangles that straddle the hidden boundary; (they, triangles with a failed corner).
 
     On the boundary the line of sight grazes the mirror, so the virtual point is the real one.
     """
@@ -331,7 +337,7 @@ def _draw_straddling(scene, mesh, target, frame, vertices, solve_boundary, gbuff
     failed = int((host_kind == 2).sum())
     ids = np.flatnonzero(host_kind == 1)
     if not len(ids):
-        return 0, failed
+        return None, failed
     corner = mesh.host_triangles[ids]
     visible = vertices.status.numpy()[corner] == int(Status.CONVERGED)
     # Turn each triangle so that the corner unlike the other two comes first.
@@ -349,6 +355,7 @@ def _draw_straddling(scene, mesh, target, frame, vertices, solve_boundary, gbuff
     solve_boundary(mesh.points, frame, wp.array(edges, dtype=wp.vec2i, device=scene.device), points)
     boundary = wp.empty(len(edges), dtype=wp.vec4, device=scene.device)
     launch(project_points_kernel, len(edges), [points, gbuffer.view, boundary], scene.device, settings.threads)
+    cut_points = points.numpy()
     known = vertices.screen.numpy()
     n = len(ids)
     cut = boundary.numpy()
@@ -368,4 +375,4 @@ def _draw_straddling(scene, mesh, target, frame, vertices, solve_boundary, gbuff
         plane_triangles=wp.array(mesh.host_triangles[owners], dtype=wp.vec3i, device=scene.device),
         threads=settings.threads,
     )
-    return n, failed
+    return Straddling(np.concatenate([a, b, c]), cut_points, triangles, owners), failed

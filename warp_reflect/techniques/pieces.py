@@ -82,6 +82,7 @@ def reflect(
         for name in LAYER_ARRAYS:
             whole[name][chosen] = getattr(answer, name).numpy()
         layer.history[number] = answer.history
+        layer.virtual += answer.virtual
         layer.statistics["pieces"] += 1
         add_statistics(layer.statistics, answer.statistics)
         add_statistics(layer.timings, answer.timings)

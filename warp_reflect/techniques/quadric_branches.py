@@ -37,7 +37,7 @@ from warp_reflect.techniques.vertices import (
     vertices_from,
     virtual_vertex,
 )
-from warp_reflect.techniques.virtual_mesh import VirtualMesh
+from warp_reflect.techniques.virtual_mesh import Drawn, VirtualMesh
 from warp_reflect.timing import StageTimer
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 2})
@@ -434,6 +434,7 @@ def reflect_branches(
                 vertices = known
                 _follow(mesh, vertices, k, follow)
             branches.append((mesh, vertices))
+        layer.virtual = [Drawn(pixels, mesh, vertices.screen) for mesh, vertices in branches]
     with timer("virtual_raster"):
         target = raster.make_target(gbuffer.view, pixels.box, scene.device, gbuffer.reflector_id, reflector.id)
         if settings.refine == "exact":

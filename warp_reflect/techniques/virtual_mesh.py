@@ -14,6 +14,7 @@ import numpy as np
 import warp as wp
 
 from warp_reflect.launch import launch
+from warp_reflect.layers import MirrorPixels
 from warp_reflect.scene import PartRange, Scene
 from warp_reflect.settings import Status
 
@@ -59,6 +60,40 @@ class VirtualMesh:
     @property
     def vertex_count(self) -> int:
         return len(self.points)
+
+
+@dataclass(frozen=True)
+class Straddling:
+    """The visible sides of triangles that cross the hidden boundary.
+
+    Attributes:
+        corners: int [k], vertices of the mesh: the first points.
+        boundary: float32 [m, 3], the points after those: on the boundary, where virtual and real point coincide; eye frame.
+        triangles: int32 [n, 3], into all of these points.
+        owners: int32 [n], the triangle of the mesh that each is a side of.
+    """
+
+    corners: np.ndarray
+    boundary: np.ndarray
+    triangles: np.ndarray
+    owners: np.ndarray
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """What was drawn into the pixels of a mirror, or of a piece of it.
+
+    Attributes:
+        pixels: Where it is seen.
+        mesh: What is reflected.
+        screen: vec4 [vertex_count], see `layers.project`: where the virtual vertices appear; key `raster.DROPPED`: nowhere.
+        straddling: What was drawn of the triangles that are partly hidden; None: nothing.
+    """
+
+    pixels: MirrorPixels
+    mesh: VirtualMesh
+    screen: wp.array
+    straddling: Straddling | None = None
 
 
 @wp.kernel
