@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import warp as wp
 
 from warp_reflect.launch import launch
@@ -79,12 +78,12 @@ def reflection_channels_kernel(
 
 def reflection_channels(
     scene: Scene, gbuffer: GBuffer, layers: dict[int, ReflectionLayer], threads: int = 0
-) -> dict[str, np.ndarray]:
-    """The channels of all layers as float32 images, 0 where there is no reflection.
+) -> dict[str, wp.array]:
+    """The channels of all layers on the scene's device, 0 where there is no reflection.
 
     Returns:
-        `mirrorPoint`, `reflectedPoint` [height, width, 3], relative to the eye, world axes, scene units;
-        `reflectedId`, `pathLength`, `residual`, `status`, `method` [height, width].
+        `mirrorPoint`, `reflectedPoint` vec3 [height * width], relative to the eye, world axes, scene units;
+        `reflectedId`, `pathLength`, `residual`, `status`, `method` float32 [height * width].
     """
     width, height = gbuffer.camera.size
     device = scene.device
@@ -103,9 +102,7 @@ def reflection_channels(
             device,
             threads,
         )
-    result = {name: array.numpy().reshape(height, width, 3) for name, array in points.items()}
-    result.update({name: array.numpy().reshape(height, width) for name, array in values.items()})
-    return result
+    return points | values
 
 
 def known_names() -> list[str]:

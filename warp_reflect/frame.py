@@ -7,6 +7,7 @@ import os
 from functools import cached_property
 
 import numpy as np
+import warp as wp
 
 from warp_reflect import __version__, images, motion, raster, shade, surface
 from warp_reflect.channels import CHANNELS, POINTS, component_of, known_names, reflection_channels
@@ -15,6 +16,9 @@ from warp_reflect.planner import Plan, find_camera
 from warp_reflect.scene import Scene
 from warp_reflect.techniques import TECHNIQUES
 from warp_reflect.timing import StageTimer
+from warp_reflect.virtual_objects import virtual_objects
+
+DIRECT = ("Z", "N", "primId")  # of what the eye sees directly
 
 
 class Frame:
@@ -78,7 +82,7 @@ class Frame:
         group, component = component_of(name)
         image = self._group(group)
         if group in POINTS:
-            there = (self._reflection["status"] > 0) if group == "mirrorPoint" else self["reflectedId"] > 0
+            there = (self._group("status") > 0) if group == "mirrorPoint" else self["reflectedId"] > 0
             world = image.astype(np.float64) + self.camera.eye
             image = np.where(there[..., None], world, 0.0).astype(np.float32)
         return image if component is None else image[..., component]
@@ -94,6 +98,32 @@ class Frame:
             raise KeyError(f"'{name}' is no point; relative to the eye are {', '.join(POINTS)}")
         image = self._group(group)
         return image if component is None else image[..., component]
+
+    def device_array(self, name: str) -> wp.array:
+        """A channel group as it lies on the device: no copy, for DLPack and the array interfaces.
+
+        `wp.to_torch`, `torch.from_dlpack`, `cupy.asarray` and `numpy.asarray` (on the CPU) take it as it is; it is the frame's
+        own memory, to be read.
+
+        Args:
+            name: A group such as `N` or `reflectionMotion`.
+
+        Returns:
+            Shape [height, width] of float32, int32 (ids of what is seen directly), vec2, vec3 or vec4; `mirrorPoint` and
+            `reflectedPoint` are relative to the eye.
+
+        Raises:
+            KeyError: an unknown name, or a component.
+        """
+        group, component = component_of(name)
+        if component is not None:
+            raise KeyError(f"'{name}' is a component; on the device lie whole groups: {', '.join(CHANNELS)}")
+        width, height = self.camera.size
+        return self._on_device(group).reshape((height, width))
+
+    def virtual_objects(self, clip: bool = False) -> list:
+        """What the mirrors show as meshes behind them, see `virtual_objects.virtual_objects`."""
+        return virtual_objects(self.scene, self.camera, self.layers, clip)
 
     def write(
         self,
@@ -134,33 +164,33 @@ class Frame:
 
     def _group(self, group: str) -> np.ndarray:
         width, height = self.camera.size
+        image = self._on_device(group).numpy().astype(np.float32, copy=False)
+        return image.reshape(height, width, *image.shape[1:])
+
+    def _on_device(self, group: str) -> wp.array:
         if group == "RGBA":
-            return self._picture[0].numpy().reshape(height, width, 4)
+            return self._picture[0]
         if group == "reflection":
-            return self._picture[1].numpy().reshape(height, width, 3)
+            return self._picture[1]
         if group == "reflectorId":
-            return self.gbuffer.reflector_id.numpy().reshape(height, width).astype(np.float32)
+            return self.gbuffer.reflector_id
         if group == "reflectionMotion":
             return self._motion
-        if group in self._direct:
-            image = self._direct[group].numpy().astype(np.float32)
-            return image.reshape((height, width, 3) if group == "N" else (height, width))
-        return self._reflection[group]
+        return self._direct[group] if group in DIRECT else self._reflection[group]
 
     @cached_property
     def _direct(self) -> dict:
         return surface.surface_channels(self.scene, self.gbuffer, self.plan.settings.threads)
 
     @cached_property
-    def _motion(self) -> np.ndarray:
+    def _motion(self) -> wp.array:
         if self._before is None:
-            width, height = self.camera.size
-            return np.zeros((height, width, 2), np.float32)
+            return wp.zeros(self.camera.size[0] * self.camera.size[1], dtype=wp.vec2, device=self.scene.device)
         threads = self.plan.settings.threads
         return motion.reflection_motion(self.scene, self.gbuffer, self.layers, *self._before, threads)
 
     @cached_property
-    def _reflection(self) -> dict[str, np.ndarray]:
+    def _reflection(self) -> dict[str, wp.array]:
         return reflection_channels(self.scene, self.gbuffer, self.layers, self.plan.settings.threads)
 
 
@@ -180,6 +210,28 @@ def render_frame(scene: Scene, plan: Plan, camera: str | Camera | None = None, p
     plan = plan.at(scene)
     settings = plan.settings
     view = plan.camera if camera is None else find_camera(scene, camera, plan.size)
+    gbuffer, layers = reflect_scene(scene, plan, view, timer, previous)
+    with timer("shade"):
+        picture = shade.shade(scene, gbuffer, layers, settings.threads, settings.shadows)
+    timings = timer.ms
+    for layer in layers.values():
+        for step, ms in layer.timings.items():
+            timings["reflect/" + step] = timings.get("reflect/" + step, 0.0) + ms
+    return Frame(scene, plan, gbuffer, layers, picture, timings, previous)
+
+
+def reflect_scene(
+    scene: Scene, plan: Plan, view: Camera, timer: StageTimer, previous: Frame | None = None
+) -> tuple[GBuffer, dict[int, ReflectionLayer]]:
+    """What the eye sees, and what the mirrors show of it: a frame before its shading.
+
+    Args:
+        scene, plan: The plan's own scene.
+        view: The camera.
+        timer: Gets the steps.
+        previous: See `render_frame`.
+    """
+    settings = plan.settings
     with timer("raster"):
         gbuffer = raster.draw_scene(scene, view, settings.threads)
     with timer("mirror_pixels"):
@@ -201,13 +253,7 @@ def render_frame(scene: Scene, plan: Plan, camera: str | Camera | None = None, p
                 row.settings,
                 _history(previous, scene, row.reflector.id),
             )
-    with timer("shade"):
-        picture = shade.shade(scene, gbuffer, layers, settings.threads, settings.shadows)
-    timings = timer.ms
-    for layer in layers.values():
-        for step, ms in layer.timings.items():
-            timings["reflect/" + step] = timings.get("reflect/" + step, 0.0) + ms
-    return Frame(scene, plan, gbuffer, layers, picture, timings, previous)
+    return gbuffer, layers
 
 
 def _history(previous: Frame | None, scene: Scene, reflector: int):

@@ -84,7 +84,7 @@ def reflection_motion_kernel(
     # Outputs:
     out_motion: wp.array(dtype=wp.vec2),
 ):
-    """One thread per mirror pixel; pixels without an answer keep what they hold."""
+    """One thread per mirror pixel, which is written at its place in the image; without an answer it keeps what it holds."""
     i = first + wp.tid()
     if triangle[i] < 0:
         return
@@ -155,12 +155,12 @@ def reflection_motion_kernel(
             at = best + step
             stage = 0
     if wanted <= ACCEPTED_PX:
-        out_motion[i] = now - best - wp.where(wanted <= SETTLED_PX, 1.0, 0.0) * step
+        out_motion[pixel[i]] = now - best - wp.where(wanted <= SETTLED_PX, 1.0, 0.0) * step
 
 
 def reflection_motion(
     scene: Scene, gbuffer: GBuffer, layers: dict[int, ReflectionLayer], before: Scene, camera: Camera, threads: int = 0
-) -> np.ndarray:
+) -> wp.array:
     """How far what is seen in the mirrors moved on the screen since the previous frame.
 
     Args:
@@ -172,11 +172,12 @@ def reflection_motion(
         threads: CPU threads; 0: one per core.
 
     Returns:
-        float32 [height, width, 2]: pixel now minus pixel then of the same material point seen in the same mirror, x to the
-        right, y down; 0 where there is no reflection, where the sky is seen, and where the previous mirror did not show it.
+        vec2 [height * width] on the scene's device: pixel now minus pixel then of the same material point seen in the same
+        mirror, x to the right, y down; 0 where there is no reflection, where the sky is seen, and where the previous mirror
+        did not show it.
     """
     width, height = gbuffer.camera.size
-    image = np.zeros((height * width, 2), np.float32)
+    image = wp.zeros(height * width, dtype=wp.vec2, device=scene.device)
     table, parts = _previous_triangles(scene, before)
     view = camera.view(before)
     for layer in layers.values():
@@ -186,19 +187,17 @@ def reflection_motion(
         if part is None or parts[part] < 0:
             continue
         mirror = parts[part]
-        motion = wp.zeros(pixels.count, dtype=wp.vec2, device=scene.device)
         launch(
             reflection_motion_kernel,
             pixels.count,
             [scene.view, gbuffer.triangle, pixels.pixel, pixels.point, pixels.direction, pixels.normal]
             + [layer.triangle, layer.u, layer.v]
             + [before.view, view, wp.array(table, dtype=int, device=scene.device)]
-            + [wp.uint64(before.part_tracer(mirror).id), before.parts[mirror].first_triangle, motion],
+            + [wp.uint64(before.part_tracer(mirror).id), before.parts[mirror].first_triangle, image],
             scene.device,
             threads,
         )
-        image[pixels.pixel.numpy()] = motion.numpy()
-    return image.reshape(height, width, 2)
+    return image
 
 
 def _previous_triangles(scene: Scene, before: Scene) -> tuple[np.ndarray, np.ndarray]:
