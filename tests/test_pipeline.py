@@ -19,7 +19,7 @@ import pytest
 from openjd.model import create_job, decode_job_template, preprocess_job_parameters
 
 import warp_reflect as wr
-from warp_reflect import cli, cluster, images, launch, pipeline
+from warp_reflect import cli, cluster, frame, images, launch, pipeline
 from warp_reflect.progress import Report
 from warp_reflect.stage.frames import snapshot_name
 from warp_reflect.stage.identity import stage_digest
@@ -193,14 +193,36 @@ def test_resumed_and_divided_ranges_are_the_same_bytes(render):
     assert contents() == whole
 
 
-def test_what_is_reused_from_frame_to_frame_starts_afresh_at_fixed_frames(render, monkeypatch):
+def test_what_is_reused_from_frame_to_frame_starts_afresh_at_fixed_frames(stage, capfd, device, monkeypatch):
     monkeypatch.setattr(pipeline, "REUSE_RUN", 3)
-    render("a.#.exr", "-f", "1:8", "--set", "reuse_px=0.5")
+    write_stage("turn.usda", MOVING_CAMERA, STILL_BOX)
+    shared = []
+    history = frame._history
+
+    def watched(*arguments):
+        shared.append(history(*arguments) is not None)
+        return history(*arguments)
+
+    monkeypatch.setattr(frame, "_history", watched)
+    options = ["-f", "1:8", "--method", "reflector_map", "--set", "reuse_px=0.5", "-w", "60", "--device", device]
+    assert cli.main(["render", "turn.usda", "a.#.exr", *options]) == 0
+    # Frames 1; 2, 3; 3 again with nothing reused, 4 to 6; 6 again, 7, 8.
+    assert shared == [False, True, True, False, True, True, True, False, True, True]
     whole = contents()
     for name in ("a.3.exr", "a.5.exr", "a.7.exr"):
         os.unlink(name)
-    render("a.#.exr", "-f", "1:8", "--set", "reuse_px=0.5", "--resume")
+    assert cli.main(["render", "turn.usda", "a.#.exr", *options, "--resume"]) == 0
+    assert names(capfd.readouterr().out.splitlines())[8:] == ["a.3.exr", "a.5.exr", "a.7.exr"]
     assert contents() == whole
+
+
+def test_frames_of_a_range_start_from_nothing_unless_asked_to(stage, device):
+    write_stage("turn.usda", MOVING_CAMERA, STILL_BOX)
+    scene = wr.load_stage("turn.usda", device, 1.0)
+    for reuse, kept in ((0.0, False), (0.5, True)):
+        plan = wr.make_plan(scene, size=(60, 45), method="reflector_map", settings=wr.Settings(reuse_px=reuse))
+        first = wr.render_frame(scene, plan)
+        assert (frame._history(first, scene.at(2.0), plan.rows[0]) is not None) == kept
 
 
 def test_frames_needed_are_the_one_before_or_a_run():

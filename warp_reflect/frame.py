@@ -12,8 +12,9 @@ import warp as wp
 from warp_reflect import __version__, images, motion, raster, shade, surface
 from warp_reflect.channels import CHANNELS, POINTS, component_of, known_names, reflection_channels
 from warp_reflect.layers import Camera, GBuffer, ReflectionLayer, add_statistics
-from warp_reflect.planner import Plan, find_camera
+from warp_reflect.planner import Plan, PlanRow, find_camera
 from warp_reflect.scene import Scene
+from warp_reflect.settings import Technique
 from warp_reflect.techniques import TECHNIQUES
 from warp_reflect.timing import StageTimer
 from warp_reflect.virtual_objects import virtual_objects
@@ -251,13 +252,19 @@ def reflect_scene(
                 pixels[row.reflector.id],
                 view,
                 row.settings,
-                _history(previous, scene, row.reflector.id),
+                _history(previous, scene, row),
             )
     return gbuffer, layers
 
 
-def _history(previous: Frame | None, scene: Scene, reflector: int):
-    """What a reflector's search may start from: the previous frame's answers for the same scene."""
-    if previous is None or previous.scene is not scene or reflector not in previous.layers:
+def _history(previous: Frame | None, scene: Scene, row: PlanRow):
+    """What a reflector's search may start from: the previous frame's answers of the same technique in the same world.
+
+    At another time of the stage only where reuse is asked for: otherwise a frame of a range depends on no other.
+    """
+    if previous is None or row.reflector.id not in previous.layers:
         return None
-    return previous.layers[reflector].history
+    if previous.scene is not scene and not (row.settings.reuse_px > 0.0 and previous.scene.shares_world(scene)):
+        return None
+    layer = previous.layers[row.reflector.id]
+    return layer.history if layer.method == Technique[row.technique.upper()] else None
