@@ -177,7 +177,7 @@ def test_search_never_answers_nan():
 @pytest.mark.parametrize(
     ("edit", "word"),
     [
-        (lambda p, f: (p, f[5:]), "open"),
+        (lambda p, f: (np.where(p[:, :1] > 0.7, p * [-0.2, 1, 1], p), f[5:]), "open"),
         (lambda p, f: (np.where(np.abs(p[:, :1]) < 0.3, p * [1, 0.2, 0.2], p), f), "convex"),
         (lambda p, f: (np.concatenate([p, p + 5]), np.concatenate([f, f + len(p)])), "star-shaped"),
     ],
@@ -214,3 +214,37 @@ def test_bare_solver_takes_a_reflector_map(dtype):
     answer = wr.solve(mirror, offset - [50.0, 0, 0], bad)
     assert list(answer.status[[0, 1, 3]]) == [Status.BAD_INPUT, Status.INSIDE, Status.HIDDEN]
     assert all(np.isfinite(x).all() for x in (answer.point, answer.normal, answer.virtual, answer.residual))
+
+
+def test_open_half_has_the_whole_bodys_reflection_points_and_masks_the_rest():
+    """Of an ellipsoid's upper half: R by construction; above, R is found and masked 1, below, the search ends off it."""
+    axes = np.array([1.5, 1.0, 0.8])
+    points, faces = ellipsoid(axes, 96, 192)
+    upper = faces[(points[faces][:, :, 1] >= -1e-9).all(axis=1)]
+    drawn = ReflectorMap.from_mesh(points, upper, 128, polish=ellipsoid_polish(axes))
+    assert not drawn.closed and 0.3 < drawn.texels[..., 3].mean() < 0.7
+    r, eye, target = constructed(axes, 4000, np.random.default_rng(6), incidence=70.0)
+    found, residual, visible = probe(drawn, eye, target, Settings())
+    above, below = r[:, 1] > 0.05, r[:, 1] < -0.05
+    assert visible[above].all()
+    error = np.linalg.norm(found - r, axis=1)[above]
+    assert np.percentile(error, 95) < 1e-3 and (residual[above] < 1e-3).mean() > 0.995
+    assert (found[below & visible][:, 1] < 1e-2).mean() > 0.995
+    assert np.isfinite(found).all() and np.isfinite(residual).all()
+
+
+@pytest.mark.parametrize(("rows", "columns", "gain"), [(16, 32, 20.0), (32, 64, 20.0)])
+def test_map_of_a_coarse_sphere_lies_on_the_sphere_its_normals_describe(rows, columns, gain):
+    """Half of Phong's displacement: distances from the sphere fall by far more than the tessellation alone would give."""
+    points, faces = ellipsoid(np.ones(3), rows, columns)
+    flat = points[faces]
+    facet = np.cross(flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0])
+    facet /= np.linalg.norm(facet, axis=1, keepdims=True)
+    radii = []
+    for normals in (np.repeat(facet[:, None], 3, axis=1), flat):
+        drawn = ReflectorMap.from_mesh(points, faces, 64, normals=normals)
+        unit = drawn.texels[..., :3].reshape(-1, 3).astype(np.float64)
+        m = drawn.unit_from_body
+        radii.append(np.linalg.norm((unit - m[:3, 3]) @ np.linalg.inv(m[:3, :3]).T, axis=1))
+    plain, lifted = (np.abs(radius - 1.0).max() for radius in radii)
+    assert lifted < plain / gain

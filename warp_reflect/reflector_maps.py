@@ -13,11 +13,12 @@ import numpy as np
 import warp as wp
 
 from warp_reflect.baked_maps import BakedMap
-from warp_reflect.bodies import CLOSING_POWER, Sheet, analyse, weld
+from warp_reflect.bodies import CLOSING_POWER, Sheet, analyse, fit_sheet, weld
 from warp_reflect.cubemap import FACE_COUNT, cube_point, face_axes, node_directions
 from warp_reflect.launch import launch
 from warp_reflect.layers import CameraView
 from warp_reflect.raster import make_target, rasterise, resolve_kernel
+from warp_reflect.segments import COSINE_MIN, OVERHANG_MAX
 
 wp.set_module_options({"enable_backward": False})
 
@@ -65,6 +66,20 @@ def nearest_texel(map: ReflectorMapView, x: wp.vec3) -> int:
     i = wp.clamp(int((c.u + 1.0) * scale + 0.5), 0, map.resolution - 1)
     j = wp.clamp(int((c.v + 1.0) * scale + 0.5), 0, map.resolution - 1)
     return texel_index(map, c.face, j, i)
+
+
+@wp.func
+def least_mask(map: ReflectorMapView, x: wp.vec3) -> float:
+    """The least mask of the four texels around a cube point: 0 on the closing part and across its border."""
+    c = cube_point(x)
+    scale = 0.5 * float(map.resolution - 1)
+    i = wp.clamp(int((c.u + 1.0) * scale), 0, map.resolution - 2)
+    j = wp.clamp(int((c.v + 1.0) * scale), 0, map.resolution - 2)
+    t = texel_index(map, c.face, j, i)
+    below = t + 2 * map.resolution
+    return wp.min(
+        wp.min(map.texels[t][3], map.texels[t + 2][3]), wp.min(map.texels[below][3], map.texels[below + 2][3])
+    )
 
 
 @wp.func
@@ -138,6 +153,11 @@ class ReflectorMap:
         return self.texels.shape[1]
 
     @property
+    def closed(self) -> bool:
+        """Whether every ray from the centre meets the reflector itself."""
+        return bool((self.texels[..., 3] > 0.0).all())
+
+    @property
     def bytes(self) -> int:
         return self.texels.nbytes
 
@@ -156,13 +176,18 @@ class ReflectorMap:
             device: Warp device of the view.
 
         Raises:
-            ValueError: The mesh is open, not star-shaped or not convex: no single-valued map holds it.
+            ValueError: The mesh is neither a closed convex body nor an open part of one's surface: no single map holds it.
         """
         points = np.asarray(points, np.float64)
         faces = np.asarray(faces, np.int32)
         body = body or analyse(points, faces)
         if not body.convex:
-            raise ValueError(f"faces: {body.reason or 'not convex'}; a reflector map needs a closed convex body")
+            sheet = None if body.closed else fit_sheet(points[faces], inner=False)
+            if sheet is not None and sheet.cosine >= COSINE_MIN and sheet.overhang <= OVERHANG_MAX:
+                return cls.from_sheet(points, faces, sheet, resolution, normals=normals, polish=polish, device=device)
+            raise ValueError(
+                f"faces: {body.reason or 'not convex'}; a reflector map needs a convex body or a part of one"
+            )
         return _draw(cls, points, faces, normals, body.centre, body.axes, body.extent, resolution, polish, device)
 
     @classmethod

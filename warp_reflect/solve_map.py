@@ -8,7 +8,7 @@ import warp as wp
 
 from warp_reflect.cubemap import project_to_cube
 from warp_reflect.optics import specular_residual, virtual_point
-from warp_reflect.reflector_maps import ReflectorMapView, sample_map
+from warp_reflect.reflector_maps import ReflectorMapView, nearest_texel, sample_map
 from warp_reflect.settings import Status
 from warp_reflect.shapes import max_abs
 from warp_reflect.solve_device import finite, to_double
@@ -28,8 +28,11 @@ HIDDEN = wp.constant(int(Status.HIDDEN))
 GRAZING = wp.constant(int(Status.GRAZING))
 MAX_ITERATIONS = wp.constant(int(Status.MAX_ITERATIONS))
 INSIDE = wp.constant(int(Status.INSIDE))
+UNREFLECTED = wp.constant(int(Status.UNREFLECTED))
 BAD_INPUT = wp.constant(int(Status.BAD_INPUT))
 GRAZING_COS = wp.constant(1.7e-3)  # cosine of 89.9 degrees, where float32 has lost three digits
+ENTRY_SAMPLES = wp.constant(64)  # along a line of sight that is blocked, to tell where it enters an open mirror's body
+ENTRY_STEPS = wp.constant(12)  # bisections of one of those steps
 # Map units: from here on a point only has a direction, and its squares would crowd out the map's digits.
 FAR = wp.constant(wp.float64(1.0e6))
 
@@ -42,6 +45,30 @@ def gauge(map: ReflectorMapView, q: wp.vec3) -> float:
         return 0.0
     s = sample_map(map, project_to_cube(w))
     return wp.length(w) / wp.max(wp.length(wp.cw_mul(s.p, map.inv_extent)), 1.0e-20)
+
+
+@wp.func
+def on_reflector(map: ReflectorMapView, q: wp.vec3) -> bool:
+    """Whether a ray from the centre through a point leaves the body through the reflector, not its closing part."""
+    return map.texels[nearest_texel(map, project_to_cube(wp.cw_mul(q, map.inv_extent)))][3] >= 0.5
+
+
+@wp.func
+def enters_reflector(map: ReflectorMapView, eye: wp.vec3, target: wp.vec3) -> bool:
+    """Whether the segment from an outside eye enters the body through the reflector, not its closing part."""
+    high = float(1.0)
+    for k in range(ENTRY_SAMPLES):
+        t = float(k + 1) / float(ENTRY_SAMPLES)
+        if high == 1.0 and gauge(map, eye + t * (target - eye)) < 1.0:
+            high = t
+    low = wp.max(high - 1.0 / float(ENTRY_SAMPLES), 0.0)
+    for _ in range(ENTRY_STEPS):
+        middle = 0.5 * (low + high)
+        if gauge(map, eye + middle * (target - eye)) < 1.0:
+            high = middle
+        else:
+            low = middle
+    return on_reflector(map, eye + high * (target - eye))
 
 
 @wp.func
@@ -63,6 +90,7 @@ def solve_map_kernel(
     map: ReflectorMapView,
     unit_from_world: wp.mat44d,
     world_from_unit: wp.mat44d,
+    closed: int,
     settings: SearchSettings,
     # Outputs:
     out_point: wp.array(dtype=Any),
@@ -85,13 +113,23 @@ def solve_map_kernel(
     if wp.abs(eye_gauge - 1.0) < GAUGE_INSIDE:
         out_status[row] = wp.uint8(BAD_INPUT)
         return
-    if eye_gauge < 1.0 or gauge(map, target) < 1.0 - GAUGE_INSIDE:
+    if eye_gauge < 1.0:
         out_status[row] = wp.uint8(INSIDE)
         return
-    if not is_visible(map, eye, target):
-        out_status[row] = wp.uint8(HIDDEN)
+    inside = gauge(map, target) < 1.0 - GAUGE_INSIDE
+    if inside and closed != 0:
+        out_status[row] = wp.uint8(INSIDE)
+        return
+    if inside or not is_visible(map, eye, target):
+        hidden = bool(True)
+        if closed == 0:
+            hidden = enters_reflector(map, eye, target)
+        out_status[row] = wp.uint8(wp.where(hidden, HIDDEN, UNREFLECTED))
         return
     r = search_newton(map, eye, target, first_guess(map, eye, target), settings.iterations, settings.tolerance)
+    if closed == 0 and not on_reflector(map, r.p):
+        out_status[row] = wp.uint8(UNREFLECTED)
+        return
     status = CONVERGED
     if r.residual > ACCEPTED:
         status = MAX_ITERATIONS

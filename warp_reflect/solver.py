@@ -354,7 +354,7 @@ def _(mirror: ReflectorMap, request: Request) -> Answer:
     unit_from_world = wp.mat44d(mirror.unit_from_body)
     world_from_unit = wp.mat44d(np.linalg.inv(mirror.unit_from_body))
     chosen = search_settings(Settings(), mirror.resolution)
-    inputs = [request.eyes, request.points, mirror.view, unit_from_world, world_from_unit, chosen]
+    inputs = [request.eyes, request.points, mirror.view, unit_from_world, world_from_unit, int(mirror.closed), chosen]
     inputs += [answer.point, answer.normal, answer.virtual, answer.residual, answer.status]
     launch(solve_map_kernel, request.count, inputs, request.points.device, request.threads)
     return answer

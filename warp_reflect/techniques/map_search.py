@@ -15,7 +15,7 @@ import warp as wp
 
 from warp_reflect.cubemap import project_to_cube
 from warp_reflect.layers import CameraView, project
-from warp_reflect.reflector_maps import MapSample, ReflectorMapView, nearest_texel, sample_map
+from warp_reflect.reflector_maps import MapSample, ReflectorMapView, least_mask, sample_map
 from warp_reflect.settings import Settings, Status
 from warp_reflect.shapes import max_abs
 from warp_reflect.techniques.vertices import SolveFrame, VertexView, edge_reach, virtual_vertex
@@ -395,8 +395,9 @@ def solve_vertex(
     out_vertex.residual[i] = r.residual
     status = CONVERGED
     if r.residual > ACCEPTED:
-        # On the part that closes an open reflector nothing is seen: any picture near the right one will do.
-        closing = map.texels[nearest_texel(map, r.x)][3] < 0.5
+        # On the part that closes an open reflector nothing is seen, and its border is a crease between two texels: any
+        # picture near the right one will do.
+        closing = least_mask(map, r.x) < 0.5
         if r.residual > map.accepted:
             # So close behind the silhouette that the bilinear body and the gauge disagree: as good as hidden, and the
             # boundary's bisection ends at the vertex itself, where virtual and real point coincide.

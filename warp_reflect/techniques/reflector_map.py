@@ -30,6 +30,7 @@ from warp_reflect.techniques.vertices import SolveFrame, VertexView, vertices_fr
 
 wp.set_module_options({"enable_backward": False})
 
+SHEET_EVALUATIONS = 40  # of a search: where a sheet's curvature jumps at its border, steps have to be shortened
 HELD_MIN = 0.25  # of a mirror's area; where its sheets hold less, nearly all of it would be traced anyway
 
 
@@ -339,6 +340,8 @@ def reflect(
         return pieces.reflect(scene, mirror, method, found, gbuffer, pixels, camera, settings, history)
     part = scene.parts[prepared.reflector.part]
     chosen = search_settings(settings, prepared.map.resolution)
+    if not prepared.map.closed and not settings.iterations:
+        chosen.iterations = SHEET_EVALUATIONS
     statistics = {}
 
     def search(points, own: list[int], frame: SolveFrame, warm: bool, out_vertex: VertexView) -> None:
