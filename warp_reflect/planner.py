@@ -172,13 +172,45 @@ def make_plan(
     for path in dict.fromkeys(material.path for material in bumpy if "normal" in material.textures):
         notes.append(Note(path, "texture of normal: a mirror reflects at the surface itself; its normal map is not used"))
     made = Plan(scene, view, settings, method, rows, notes)
-    if earlier is not None and earlier.scene.shares_world(scene):
-        before = {row.reflector: row for row in earlier.rows}
-        for row in rows:
-            known = before.get(row.reflector)
-            if known is not None and (known.technique, known.settings) == (row.technique, row.settings):
-                made._prepared |= {k: v for k, v in earlier._prepared.items() if k == row.reflector.id}
+    _take_over(made, earlier)
     return made
+
+
+def prefer_forward(plan: Plan, earlier: Plan | None = None) -> Plan:
+    """The plan with virtual objects wherever they can be: no mirror is traced because that is expected to be faster.
+
+    Args:
+        plan: Rows that were forced stay.
+        earlier: As for `make_plan`.
+    """
+    scene, camera = plan.scene, plan.camera
+    rows = []
+    for row in plan.rows:
+        held = [(name, *_applies(scene, row.reflector, camera, name)) for name in PREFERRED]
+        chosen = next(((name, reason) for name, applies, reason in held if applies), None)
+        if row.technique == "raytraced" and not row.forced and plan.method == "auto" and chosen is not None:
+            name, reason = chosen
+            predicted = budget.predict(
+                scene, name, row.pixels, row.settings, *_work(scene, row.reflector, camera, name)
+            )
+            reason = f"{reason}; for its virtual objects"
+            row = dataclasses.replace(row, technique=name, reason=reason, predicted=predicted)
+        rows.append(row)
+    made = dataclasses.replace(plan, rows=rows, _prepared={})
+    _take_over(made, plan)
+    _take_over(made, earlier)
+    return made
+
+
+def _take_over(made: Plan, earlier: Plan | None) -> None:
+    """Hand over what an earlier plan's techniques prepared, where it is still that."""
+    if earlier is None or not earlier.scene.shares_world(made.scene):
+        return
+    before = {row.reflector: row for row in earlier.rows}
+    for row in made.rows:
+        known = before.get(row.reflector)
+        if known is not None and (known.technique, known.settings) == (row.technique, row.settings):
+            made._prepared |= {k: v for k, v in earlier._prepared.items() if k == row.reflector.id}
 
 
 def find_camera(scene: Scene, camera: str | Camera | None, size: tuple[int, int]) -> Camera:

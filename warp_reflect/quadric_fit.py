@@ -149,9 +149,7 @@ def _residuals(quadric: CanonicalQuadric, points: np.ndarray, normals: np.ndarra
     x = (points - quadric.origin) @ quadric.axes / quadric.size
     gradient = x * quadric.lam + [0.0, 0.0, quadric.b]
     length = np.linalg.norm(gradient, axis=1)
-    value = (x * x) @ quadric.lam + 2.0 * quadric.b * x[:, 2] + quadric.c
-    distance = np.abs(value) / (length + np.sqrt(length * length + np.abs(value)))
     good = length > 0.0  # a cone's apex has no normal
     surface = (gradient[good] / length[good, None]) @ quadric.axes.T
     sine = np.linalg.norm(np.cross(surface, normals[good]), axis=1)
-    return float(distance.max()) * quadric.size, float(sine.max(initial=0.0))
+    return float(quadric.distances(points).max()), float(sine.max(initial=0.0))

@@ -93,6 +93,17 @@ class CanonicalQuadric:
         """The reflecting side is the outside of a convex body, or of two."""
         return not self.inner and FAMILY[self.kind] != Family.GENERAL
 
+    def distances(self, points: np.ndarray) -> np.ndarray:
+        """First-order distances from the surface of points near it, float64 [n], in scene units.
+
+        Args:
+            points: World, [n, 3].
+        """
+        x = (points - self.origin) @ self.axes / self.size
+        slope = np.linalg.norm(x * self.lam + [0.0, 0.0, self.b], axis=1)
+        value = np.abs((x * x) @ self.lam + 2.0 * self.b * x[:, 2] + self.c)
+        return self.size * value / (slope + np.sqrt(slope * slope + value))
+
 
 def canonical_quadric(
     a: np.ndarray, b: np.ndarray, c: float, offset: np.ndarray, name: str, rank_tolerance: float

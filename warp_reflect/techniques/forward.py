@@ -193,6 +193,7 @@ def reflect(
     settings: Settings,
     history: History | None,
     greatest_curvature: float | None = None,
+    wary: bool = False,
 ) -> ReflectionLayer:
     """Reflect a scene in one mirror by virtual objects.
 
@@ -203,6 +204,7 @@ def reflect(
         solve_boundary: (points, frame, edges vec2i, out points vec3) -> None, see `reflector_map.boundary_kernel`.
         history: The same reflector's layer history of the previous frame.
         greatest_curvature: Of the mirror, unit frame; None: its vertices are solved anew every frame.
+        wary: The solver's surface is not quite the mirror's own, see `refine.settle`.
 
     Returns:
         The layer; with `refine="exact"` every pixel is the hit of an exact ray-triangle test.
@@ -249,9 +251,7 @@ def reflect(
         if settings.refine == "exact":
             raster.attach_rays(target, gbuffer.view, pixels, settings.threads)
         drawn = raster.rasterise(target, vertices.screen, mesh.triangles, points=mesh.points, threads=settings.threads)
-        straddling, failed = _draw_straddling(
-            scene, mesh, target, frame, vertices, solve_boundary, gbuffer, settings
-        )
+        straddling, failed = _draw_straddling(scene, mesh, target, frame, vertices, solve_boundary, gbuffer, settings)
         clipped = 0 if straddling is None else len(straddling.boundary) // 2
         layer.virtual = [Drawn(pixels, mesh, vertices.screen, straddling)]
     if settings.refine == "off":
@@ -274,7 +274,7 @@ def reflect(
                 blocked = bvh.own_obstacles(scene, gbuffer, pixels, reflector.part, settings.threads)
         with timer("refine"):
             doubtful = refine.settle(
-                scene, gbuffer, pixels, target, mesh, layer, blocked, settings, trust_sky=failed == 0
+                scene, gbuffer, pixels, target, mesh, layer, blocked, settings, trust_sky=failed == 0, wary=wary
             )
         with timer("trace"):
             bvh.trace_pixels(

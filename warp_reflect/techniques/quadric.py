@@ -90,12 +90,18 @@ def has_branches(scene: Scene, reflector: Reflector, camera: Camera) -> bool:
     return False
 
 
+def passes(scene: Scene, reflector: Reflector) -> int:
+    """How often a frame reflects every vertex of the scene: of parallel caps the eye sees one."""
+    sheets = sheets_of(scene, reflector.part)
+    return sum(sheet.quadric is not None for sheet in sheets) + any(sheet.plane is not None for sheet in sheets)
+
+
 def prepare(scene: Scene, reflector: Reflector, settings: Settings) -> Prepared:
     """Every patch in its unit frame."""
     found = []
     for sheet in sheets_of(scene, reflector.part):
         if sheet.quadric is not None:
-            found += _sides(scene, reflector, sheet.triangles, sheet.quadric)
+            found += _sides(scene, reflector, sheet)
         else:
             found.append(Piece(sheet.triangles, planar, planar.Prepared(reflector, sheet.plane)))
     return Prepared(reflector, _numbered(found))
@@ -129,12 +135,13 @@ def _numbered(found: list[Piece]) -> list[Piece]:
     ]
 
 
-def _sides(scene: Scene, reflector: Reflector, own: np.ndarray, quadric: CanonicalQuadric) -> list[Piece]:
-    """The sides of a quadric patch that the eye can see."""
+def _sides(scene: Scene, reflector: Reflector, sheet: Sheet) -> list[Piece]:
+    """The sides of a quadric sheet that the eye can see."""
+    own, quadric = sheet.triangles, sheet.quadric
     corner = scene.host_points[scene.host_triangles[own]].reshape(-1, 3).astype(np.float64)
     quadric = _towards(quadric, corner)
     convex = FAMILY[quadric.kind] != Family.GENERAL
-    outside = quadric_patch.Prepared(reflector, quadric, quadric_patch.similarity(quadric))
+    outside = quadric_patch.Prepared(reflector, quadric, quadric_patch.similarity(quadric), sheet.distance > 0.0)
     if reflector.convex and convex:
         return [Piece(own, quadric_patch, outside)]
 

@@ -79,11 +79,13 @@ class Prepared:
         reflector: The mirror; its id is what the mask holds at the patch's pixels.
         quadric: World is the scene frame.
         unit_from_scene: float64 [4, 4], a similarity.
+        wary: The mirror is a mesh that the quadric describes, not the quadric itself.
     """
 
     reflector: Reflector
     quadric: CanonicalQuadric
     unit_from_scene: np.ndarray
+    wary: bool = False
     bytes: int = 0
 
 
@@ -177,4 +179,5 @@ def reflect(
         settings,
         history,
         greatest_curvature(prepared.quadric),
+        prepared.wary,
     )

@@ -26,7 +26,7 @@ class Sheet:
         triangles: Ids of its triangles in the scene, ascending.
         quadric: World is the scene frame; None: a plane, or nothing that was recognised.
         plane: float64 [4, 4], see `planar.plane_frame`; None: a quadric.
-        distance: Largest distance of its points from the surface; 0 for gprims. [scene units]
+        distance: Largest distance of its corners and facets from the surface; 0 for gprims. [scene units]
         sine: Largest sine between its normals and the surface's; 0 for gprims.
         name: What it is, with its measures where a mesh was recognised.
     """
@@ -95,7 +95,9 @@ def _recognised(scene: Scene, part: PartRange) -> list[Sheet]:
         fit = fit_quadric(corner.reshape(-1, 3), normal.reshape(-1, 3))
         if fit is None:
             return [*found, Sheet(own, None, None, np.inf, 1.0, "no quadric passes through its points")]
-        found.append(Sheet(own, fit.quadric, None, fit.distance, fit.sine, str(fit)))
+        # The mesh shows its facets, which leave the surface between their corners.
+        sagitta = fit.quadric.distances(corner.mean(axis=1)).max()
+        found.append(Sheet(own, fit.quadric, None, max(fit.distance, float(sagitta)), fit.sine, str(fit)))
     return found
 
 

@@ -141,6 +141,7 @@ def settle_kernel(
     # Settings:
     hop_count: int,
     trust_sky: int,
+    wary: int,
     # Outputs:
     out_triangle: wp.array(dtype=int),
     out_u: wp.array(dtype=float),
@@ -199,13 +200,15 @@ def settle_kernel(
                     return
                 other = raster.key_triangle(near_key)
                 separate = patches[other] != patch and near > NEARER_SHARE * depth
-                if other != tested and (separate or bend > FINE_STEP * depth):
+                if other != tested and (wary != 0 or separate or bend > FINE_STEP * depth):
                     tested = other
                     second = walk(scene, neighbours, point[i], direction[i], parents[other], hop_count)
                     if second.triangle >= 0 and second.t < hit.t:
                         if second.turned != 0:
                             return
                         hit = second
+    if wary != 0 and hit.hops > 0:
+        return
     out_triangle[i] = hit.triangle
     out_u[i] = hit.u
     out_v[i] = hit.v
@@ -224,6 +227,7 @@ def settle(
     blocked: wp.array,
     settings: Settings,
     trust_sky: bool,
+    wary: bool = False,
 ) -> wp.array:
     """Write the hits that a virtual picture settles into the layer.
 
@@ -233,6 +237,8 @@ def settle(
         layer: Receives triangle, u, v, distance, status of the settled pixels, and their counts.
         blocked: uint8 [pixels.count], 1 where the mirror's own body (which is not drawn) is in the way; length 0: nowhere.
         trust_sky: No virtual triangle was dropped: an empty neighbourhood is sky.
+        wary: The picture may be off by a part of a pixel: every candidate of the neighbourhood is
+            tested, and what none of them is hit by directly is left to the BVH.
 
     Returns:
         int32 indices into `pixels` of what the BVH must decide.
@@ -253,7 +259,7 @@ def settle(
             pixels.direction,
             blocked,
         ]
-        + [settings.walk_hops, int(trust_sky)]
+        + [settings.walk_hops, int(trust_sky), int(wary)]
         + [layer.triangle, layer.u, layer.v, layer.distance, layer.status, settled],
         scene.device,
         settings.threads,
