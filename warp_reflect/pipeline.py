@@ -418,7 +418,7 @@ def run(
     report.busy("planning")
     plan = opened[0].plan_at(places[0])
     report.notes([*plan.scene.notes, *plan.notes])
-    _check_range(job, places, plan.scene.data.time_range, strict, report)
+    check_range(job, places, plan.scene.data.time_range, strict, report)
     with listening(job, report) as asked:
         if on_cluster:
             from warp_reflect.cluster import render_on_cluster
@@ -430,16 +430,16 @@ def run(
         else:
             source = render_places(job, places, digest, opened, resume, asked.is_stopped, deadline)
         states: dict[int, str] = {}
-        _tell_all(source, job, report, asked, states, debug)
+        tell_all(source, job, report, asked, states, debug)
         taken = [place for place in places if states.get(place) == "taken"]
         if resume and taken:
             # Whoever was at them may have finished them since.
             again = render_places(job, taken, digest, opened, True, asked.is_stopped, deadline)
-            _tell_all(again, job, report, asked, states, debug)
-    return _conclude(job, places, states, asked, report)
+            tell_all(again, job, report, asked, states, debug)
+    return conclude(job, places, states, asked, report)
 
 
-def _tell_all(source, job: Job, report: Report, asked: Asked, states: dict[int, str], debug: bool) -> None:
+def tell_all(source, job: Job, report: Report, asked: Asked, states: dict[int, str], debug: bool) -> None:
     """Tell of outcomes as they come; where a second signal breaks off, of how far it got."""
     try:
         for outcome in source:
@@ -455,9 +455,10 @@ def _tell_all(source, job: Job, report: Report, asked: Asked, states: dict[int, 
         asked.lost = one_line(error)
 
 
-def _conclude(job: Job, places: list[int], states: dict[int, str], asked: Asked, report: Report) -> int:
+def conclude(job: Job, places: list[int], states: dict[int, str], asked: Asked, report: Report) -> int:
     """Say what is missing and how to go on; returns the exit code."""
     written = [name for place in places if states.get(place) == "written" for name in job.files[place]]
+    written = list(dict.fromkeys(written))
     bad = [place for place in places if states.get(place) in ("failed", "taken")]
     left = len(places) - len(states)
     code = PART_WAY if bad or left else DONE
@@ -477,7 +478,8 @@ def _conclude(job: Job, places: list[int], states: dict[int, str], asked: Asked,
     return code
 
 
-def _check_range(job: Job, places: list[int], time_range, strict: bool, report: Report) -> None:
+def check_range(job: Job, places: list[int], time_range, strict: bool, report: Report) -> None:
+    """Tell of frames outside of the stage's range; where strict, refuse them by a ValueError."""
     if time_range is None:
         return
     first, last = time_range

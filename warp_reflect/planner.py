@@ -332,7 +332,7 @@ def _work(scene, reflector, camera: Camera, technique: str) -> tuple[bool, int, 
     """`budget.predict`'s branches, passes and held."""
     module = TECHNIQUES[technique]
     branches = technique in ("quadric", "reflector_map") and module.has_branches(scene, reflector, camera)
-    passes, held = module.extent(scene, reflector) if technique == "reflector_map" else (1, 1.0)
+    passes, held = module.extent(scene, reflector) if technique in ("quadric", "reflector_map") else (1, 1.0)
     return branches, passes, held
 
 
