@@ -331,6 +331,17 @@ def test_solid_with_rims_is_solved_patch_by_patch(built):
     assert frame.statistics["bvh"] < 0.5 * (frame["reflectorId"] > 0).sum()
 
 
+def test_mesh_with_rims_is_recognised_sheet_by_sheet():
+    scene = room(plain_mesh(gprims.cylinder(0.7, 0.4, 1.2, "X")), eye=(1.5, 0.9, 3.0))
+    frame = render(scene, "quadric")
+    reason = frame.plan.rows[0].reason
+    assert "recognised as cone, plane (3 patches)" in reason
+    assert identical(frame, render(scene, "reference")) >= 0.999
+    # A capsule is smooth all over and no quadric.
+    row = render(room(plain_mesh(gprims.capsule(0.5, 0.5, 0.8, "Y"))), "quadric").plan.rows[0]
+    assert row.technique == "raytraced" and "not recognised" in row.reason
+
+
 def bowl() -> MeshData:
     """The far half of a sphere of radius 1: its inside faces +Z."""
     built = gprims.sphere(1.0)

@@ -90,10 +90,10 @@ def has_branches(scene: Scene, reflector: Reflector, camera: Camera) -> bool:
     return False
 
 
-def passes(scene: Scene, reflector: Reflector) -> int:
-    """How often a frame reflects every vertex of the scene: of parallel caps the eye sees one."""
+def extent(scene: Scene, reflector: Reflector) -> tuple[int, float]:
+    """(how often a frame reflects every vertex of the scene: of parallel caps the eye sees one; share that it holds)."""
     sheets = sheets_of(scene, reflector.part)
-    return sum(sheet.quadric is not None for sheet in sheets) + any(sheet.plane is not None for sheet in sheets)
+    return sum(sheet.quadric is not None for sheet in sheets) + any(sheet.plane is not None for sheet in sheets), 1.0
 
 
 def prepare(scene: Scene, reflector: Reflector, settings: Settings) -> Prepared:
