@@ -161,10 +161,11 @@ def test_scene_takes_the_techniques_it_lists(name, device):
         assert {row.path for row in frame.plan.rows if row not in taken} <= noted
 
 
-def test_body_with_sharp_rims_is_traced_beside_one_that_is_mapped(device):
+def test_body_with_sharp_rims_is_mapped_in_pieces_beside_one_that_is_whole(device):
     rows = {row.path: row for row in rendered("capped_cylinder", device, "reflector_map").plan.rows}
-    assert (rows["/World/Cylinder"].technique, rows["/World/Cylinder"].forced) == ("raytraced", False)
-    assert (rows["/World/Capsule"].technique, rows["/World/Capsule"].forced) == ("reflector_map", True)
+    assert all(row.technique == "reflector_map" and row.forced for row in rows.values())
+    assert "3 pieces hold 100 %" in rows["/World/Cylinder"].reason and "2 planar" in rows["/World/Cylinder"].reason
+    assert "closed convex" in rows["/World/Capsule"].reason
 
 
 @pytest.mark.parametrize("method", ["reference", "reflector_map"])

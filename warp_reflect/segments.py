@@ -33,8 +33,8 @@ NORMAL_WEIGHT = 0.7  # of a unit normal against a position in sizes, where a reg
 # 85 degrees between a facet's normal and the ray that reaches it: beyond, its map is stretched too much to be of use.
 COSINE_MIN = 0.08
 # Of a sheet's size: a corner may stand out over other facets by so much. Where a sheet is not convex a vertex has pictures
-# that a search for one does not find: at 1e-2 one pixel in 300 of a car showed what lies behind, at 2e-3 one in 1600.
-OVERHANG_MAX = 2.0e-3
+# that a search for one does not find: at 1e-2 one pixel in 300 of a car showed what lies behind, at 8e-4 one in 1500.
+OVERHANG_MAX = 8.0e-4
 TRIM_SHARE = 0.5  # of a region's area that must be left when its overhung triangles are cut off; else it is halved
 FLATNESS_MAX = 1.0e-6  # of a sheet's size: off its plane by less it is a plane
 
