@@ -60,7 +60,7 @@ def bake_stage(
     settings = settings or Settings()
     source = scene.data.source
     path = write.check_layer_writable(path, source)
-    stage = write.open_baked_stage(source)
+    stage = write.open_source(source)
     write.layer_over(stage, source, path)  # refused before the work, if at all
     plan = make_plan(scene, size=PREVIEW_SIZE, settings=settings, method=METHOD)
     mirrors, notes, taken = [], [], set()

@@ -1,4 +1,4 @@
-"""The `warp-reflect` command: `plan`, `render`, `bake`, `compare`.
+"""The `warp-reflect` command: `plan`, `render`, `bake`, `process`, `compare`.
 
 Results go to standard output, notes and errors to standard error. Exit 0: done; 1: a job failed part way;
 2: cannot be done, with one line that says why; 130, 143: stopped by SIGINT, SIGTERM.
@@ -350,6 +350,68 @@ def bake(
         report.notes([*scene.notes, *baked.notes])
     print(f"{baked.layer}: {len(baked.files)} mirror{'s' * (len(baked.files) != 1)} baked, over {stage}")
     return DONE
+
+
+@app.command
+def process(
+    stage: str,
+    out: str,
+    /,
+    *,
+    frames: Annotated[str | None, Parameter(name=["--frames", "-f"])] = None,
+    clip: Annotated[bool, Parameter(negative=())] = False,
+    purpose: str = "guide",
+    glb: str | None = None,
+    resume: Annotated[bool, Parameter(negative=())] = False,
+    timelimit: float | None = None,
+    progress: str | None = None,
+    opened: StageOptions | None = None,
+    planned: PlanOptions | None = None,
+) -> int:
+    """Write what mirrors show as virtual objects, meshes behind the mirrors, into a layer over the stage.
+
+    They are right for the camera they were made for. Traced mirrors have none; a note says which.
+
+    Args:
+        stage: A USD file; it is not changed.
+        out: The layer to write, .usd, .usda or .usdc.
+        frames: Frames such as 101:109x2,120, as time samples; without it the stage's first, as default values.
+        clip: Cut virtual objects along the outline of the pixels that show their mirror, so that a renderer that hides the
+            mirrors shows the same picture.
+        purpose: Of the virtual objects: default, render, proxy or guide, which renderers leave out.
+        glb: Write those of the first frame as a binary glTF file, too.
+        resume: Keep the frames that the layer has, where it was made from the same stage and options.
+        timelimit: Seconds after which no frame is begun.
+        progress: As of render.
+        opened: How the stage is opened.
+        planned: What is simulated, and how.
+    """
+    from warp_reflect import process as processing
+    from warp_reflect.stage.frames import parse_frames
+
+    opened, planned = opened or StageOptions(), planned or PlanOptions()
+    if opened.untrusted:
+        raise ValueError("--untrusted: a stage is processed by opening it here; render it untrusted instead")
+    settings = _settings(planned)
+    _check_method(planned.method)
+    _check_size_options(planned)
+    times = (None,) if frames is None else tuple(dict.fromkeys(parse_frames(frames)))
+    job = processing.make_job(
+        stage,
+        out,
+        times,
+        load=_load_options(opened, planned, settings) | {"device": _open_device(opened.device)},
+        camera=planned.camera,
+        width=planned.image_width,
+        size=_size(planned.res) if planned.res is not None else None,
+        settings=settings,
+        method=planned.method,
+    )
+    wish = processing.Wish(clip, purpose, glb or "")
+    with reporting(progress) as report:
+        return processing.run(
+            job, wish, report, resume=resume, seconds=timelimit, strict=opened.strict, debug=opened.debug
+        )
 
 
 @app.command

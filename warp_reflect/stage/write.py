@@ -36,19 +36,28 @@ def check_layer_writable(path: str | os.PathLike, stage_path: str | os.PathLike)
     path = Path(path)
     if path.suffix.lower() not in EXTENSIONS:
         raise ValueError(f"{path}: cannot write a '{path.suffix}' layer; use {', '.join(EXTENSIONS)}")
+    if path.resolve() == Path(stage_path).resolve():
+        raise ValueError(f"{path}: is the stage itself; give another name")
+    check_place(path)
+    return path
+
+
+def check_place(path: Path) -> None:
+    """Refuse a file that could not be written.
+
+    Raises:
+        OSError: the folder is missing or cannot be written, or the name is taken by something that is no file.
+    """
     if path.exists() and not path.is_file():
         raise OSError(f"{path}: cannot be written: it exists and is not a regular file")
     if not path.parent.is_dir():
         raise OSError(f"{path}: cannot be written: the folder '{path.parent}' does not exist; make it first")
-    if path.resolve() == Path(stage_path).resolve():
-        raise ValueError(f"{path}: is the stage itself; give another name")
-    probe = _passing_name(path)
+    probe = passing_name(path)
     try:
         os.close(os.open(probe, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
         os.unlink(probe)
     except OSError as error:
         raise OSError(f"{path}: cannot be written: {error.strerror}") from None
-    return path
 
 
 def layer_over(stage: Usd.Stage, stage_path: str | os.PathLike, path: Path) -> Sdf.Layer:
@@ -70,15 +79,15 @@ def layer_over(stage: Usd.Stage, stage_path: str | os.PathLike, path: Path) -> S
     return layer
 
 
-def save_layer(layer: Sdf.Layer, path: Path) -> None:
-    """Write a layer whole: text as .usd and .usda, binary as .usdc.
+def save_layer(layer: Sdf.Layer, path: Path, usd_format: str = "usda") -> None:
+    """Write a layer whole: text as .usda, binary as .usdc, and as .usd what is asked for ("usda" or "usdc").
 
     Raises:
         OSError: it could not be written; an older file under the name is still whole.
     """
     final = Path(os.path.realpath(path))
-    part = _passing_name(final)
-    arguments = {"format": "usda"} if final.suffix.lower() == ".usd" else {}
+    part = passing_name(final)
+    arguments = {"format": usd_format} if final.suffix.lower() == ".usd" else {}
     try:
         try:
             good = layer.Export(str(part), args=arguments)
@@ -93,7 +102,8 @@ def save_layer(layer: Sdf.Layer, path: Path) -> None:
         part.unlink(missing_ok=True)
 
 
-def _passing_name(path: Path) -> Path:
+def passing_name(path: Path) -> Path:
+    """The name in the same folder that a file has while it is written."""
     return path.with_name(f".{os.getpid()}-{path.stem[:60]}.part{path.suffix}")
 
 
@@ -157,7 +167,7 @@ def write_baked_layer(
         OSError: the layer could not be written.
     """
     path = Path(path)
-    stage = open_baked_stage(stage_path)
+    stage = open_source(stage_path)
     with quiet():
         layer = layer_over(stage, stage_path, path)
         known = dict(layer.customLayerData)
@@ -176,8 +186,8 @@ def write_baked_layer(
         save_layer(layer, path)
 
 
-def open_baked_stage(stage_path: str | os.PathLike) -> Usd.Stage:
-    """The stage that is baked, for what a `Scene` does not keep.
+def open_source(stage_path: str | os.PathLike) -> Usd.Stage:
+    """The stage that a layer is written over, for what a `Scene` does not keep.
 
     Raises:
         FileNotFoundError, ValueError: as `read.open_stage`.
