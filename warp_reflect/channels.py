@@ -47,8 +47,11 @@ def reflection_channels_kernel(
     direction: wp.array(dtype=wp.vec3),
     # Layer:
     triangle: wp.array(dtype=int),
+    u: wp.array(dtype=float),
+    v: wp.array(dtype=float),
     distance: wp.array(dtype=float),
     status: wp.array(dtype=wp.uint8),
+    on_ray: int,
     # Outputs:
     out_mirror_point: wp.array(dtype=wp.vec3),
     out_reflected_point: wp.array(dtype=wp.vec3),
@@ -69,17 +72,30 @@ def reflection_channels_kernel(
     if triangle[i] < 0:
         return
     reflected = mirror + distance[i] * direction[i]
+    if on_ray == 0:
+        # What is shown is not what the reflected ray meets.
+        corners = scene.triangles[triangle[i]]
+        weight = 1.0 - u[i] - v[i]
+        shown = weight * scene.points[corners[0]] + u[i] * scene.points[corners[1]] + v[i] * scene.points[corners[2]]
+        reflected = shown - camera.eye
     origin = eye_ray_origin(camera, float(p - row * camera.width) + 0.5, float(row) + 0.5)
     out_reflected_point[p] = reflected
     out_reflected_id[p] = float(scene.patches[scene.triangle_patch[triangle[i]]].prim)
-    out_path_length[p] = wp.length(mirror - origin) + distance[i]
+    out_path_length[p] = wp.length(mirror - origin) + wp.length(reflected - mirror)
     out_residual[p] = specular_residual(mirror, normal[i], origin, reflected)
 
 
 def reflection_channels(
-    scene: Scene, gbuffer: GBuffer, layers: dict[int, ReflectionLayer], threads: int = 0
+    scene: Scene,
+    gbuffer: GBuffer,
+    layers: dict[int, ReflectionLayer],
+    threads: int = 0,
+    unrefined: frozenset[int] = frozenset(),
 ) -> dict[str, wp.array]:
     """The channels of all layers on the scene's device, 0 where there is no reflection.
+
+    Args:
+        unrefined: Reflectors whose pixels show the virtual triangle drawn there, whether the reflected ray meets it or not.
 
     Returns:
         `mirrorPoint`, `reflectedPoint` vec3 [height * width], relative to the eye, world axes, scene units;
@@ -90,14 +106,14 @@ def reflection_channels(
     points = {name: wp.zeros(width * height, dtype=wp.vec3, device=device) for name in POINTS}
     names = ("reflectedId", "pathLength", "residual", "status", "method")
     values = {name: wp.zeros(width * height, dtype=float, device=device) for name in names}
-    for layer in layers.values():
+    for number, layer in layers.items():
         pixels = layer.pixels
         launch(
             reflection_channels_kernel,
             pixels.count,
             [scene.view, gbuffer.view, layer.method]
             + [pixels.pixel, pixels.point, pixels.normal, pixels.direction]
-            + [layer.triangle, layer.distance, layer.status]
+            + [layer.triangle, layer.u, layer.v, layer.distance, layer.status, int(number not in unrefined)]
             + [*points.values(), *values.values()],
             device,
             threads,

@@ -192,7 +192,10 @@ class Frame:
 
     @cached_property
     def _reflection(self) -> dict[str, wp.array]:
-        return reflection_channels(self.scene, self.gbuffer, self.layers, self.plan.settings.threads)
+        drawn = frozenset(
+            row.reflector.id for row in self.plan.rows if row.settings.refine == "off" and row.technique != "raytraced"
+        )
+        return reflection_channels(self.scene, self.gbuffer, self.layers, self.plan.settings.threads, drawn)
 
 
 def render_frame(scene: Scene, plan: Plan, camera: str | Camera | None = None, previous: Frame | None = None) -> Frame:
