@@ -64,7 +64,9 @@ def rectangles(mask: np.ndarray) -> np.ndarray:
     # Of the same columns in consecutive rows: sorted by columns, then rows, they follow each other.
     order = np.lexsort((row, end, start))
     row, start, end = row[order], start[order], end[order]
-    new = np.r_[True, (np.diff(start) != 0) | (np.diff(end) != 0) | (np.diff(row) != 1)][: len(row)]
+    if not len(row):
+        return np.zeros((0, 4), int)
+    new = np.r_[True, (np.diff(start) != 0) | (np.diff(end) != 0) | (np.diff(row) != 1)]
     first = np.flatnonzero(new)
     last = np.r_[first[1:], len(row)] - 1
     return np.stack([start[first], row[first], end[first], row[last] + 1], axis=1).astype(int)

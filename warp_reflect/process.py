@@ -213,6 +213,8 @@ def _lack(row: PlanRow, layer: ReflectionLayer | None) -> str:
         return ""
     if row.technique == "raytraced":
         return f"no virtual objects: {row.reason}"
+    if not row.reflector.convex and row.technique != "planar":
+        return "not convex: where it shows itself, or hides things from itself, its virtual objects do not tell"
     pixels = {id(drawn.pixels): drawn.pixels.count for drawn in layer.virtual}
     if sum(pixels.values()) < layer.pixels.count:
         return "its virtual objects are not seen at all of its pixels: a part of it is held by rays alone"
