@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from warp_reflect.launch import thread_count
-from warp_reflect.scene import Scene
+from warp_reflect.scene import PartRange, Scene
 from warp_reflect.settings import Settings
 
 # Microseconds per element on one CPU thread (a 2026 server core). Ratios between them decide, and those vary less from
@@ -13,17 +13,30 @@ RASTER_US = 0.35  # per virtual triangle, the clipping at the hidden boundary in
 REFINE_US = 0.18  # per mirror pixel
 TRACE_US = 0.6  # per mirror pixel at 60,000 triangles; grows with their logarithm, which is left out
 DOUBT_SHARE = 0.05  # of the mirror pixels that refinement leaves to the BVH
-BRANCHES_US = 20.0  # per vertex of the scene, where all its reflection points on a concave side are searched (4 a search)
+BRANCHES_US = (
+    20.0  # per vertex of the scene, where all its reflection points on a concave side are searched (4 a search)
+)
 OWN_BODY_US = 0.25  # per pixel of a mirror that may see itself
 CURVED_SHARE = 2.0  # virtual vertices and triangles per one of the scene, where a curved mirror bends edges
 
 
 def predict(
-    scene: Scene, technique: str, pixels: int, settings: Settings, branches: bool = False, passes: int = 1, held: float = 1.0
+    scene: Scene,
+    part: PartRange,
+    technique: str,
+    pixels: int,
+    settings: Settings,
+    branches: bool = False,
+    passes: int = 1,
+    held: float = 1.0,
 ) -> dict[str, float]:
     """Predicted `error_px`, `ms` per frame and prepared `bytes` of a reflector.
 
     Args:
+        part: The mirror; its own vertices and triangles have no picture in it.
+        technique: A key of `TECHNIQUES`.
+        pixels: At which it is seen.
+        settings: The knobs.
         branches: The mirror is seen from within, and every vertex may appear several times (`quadric` and
             `reflector_map`).
         passes: How often every vertex is reflected: once for every sheet of a mirror.
@@ -33,14 +46,15 @@ def predict(
     traced = pixels * TRACE_US
     if technique == "raytraced" or pixels == 0:
         return {"error_px": 0.0, "ms": 1e-3 * traced / threads, "bytes": 0}
-    forward = scene.vertex_count * SEARCH_US + scene.triangle_count * RASTER_US
+    vertices = scene.vertex_count - (part.vertex_count if part.is_whole else 0)
+    forward = vertices * SEARCH_US + (scene.triangle_count - part.triangle_count) * RASTER_US
     if technique != "planar":
         forward *= CURVED_SHARE
     forward *= passes
     if held < 1.0 or passes > 1:
         forward += pixels * ((1.0 - held) * TRACE_US + OWN_BODY_US)
     if branches:
-        forward += scene.vertex_count * BRANCHES_US + pixels * OWN_BODY_US
+        forward += vertices * BRANCHES_US + pixels * OWN_BODY_US
     if settings.refine == "exact":
         forward += pixels * (REFINE_US + DOUBT_SHARE * TRACE_US)
     bytes_ = passes * 6 * settings.map_resolution**2 * 32 if technique == "reflector_map" else 0

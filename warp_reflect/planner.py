@@ -170,7 +170,9 @@ def make_plan(
     ]
     bumpy = [scene.data.materials[part.material] for _, part, _ in found]
     for path in dict.fromkeys(material.path for material in bumpy if "normal" in material.textures):
-        notes.append(Note(path, "texture of normal: a mirror reflects at the surface itself; its normal map is not used"))
+        notes.append(
+            Note(path, "texture of normal: a mirror reflects at the surface itself; its normal map is not used")
+        )
     made = Plan(scene, view, settings, method, rows, notes)
     _take_over(made, earlier)
     return made
@@ -190,9 +192,9 @@ def prefer_forward(plan: Plan, earlier: Plan | None = None) -> Plan:
         chosen = next(((name, reason) for name, applies, reason in held if applies), None)
         if row.technique == "raytraced" and not row.forced and plan.method == "auto" and chosen is not None:
             name, reason = chosen
-            predicted = budget.predict(
-                scene, name, row.pixels, row.settings, *_work(scene, row.reflector, camera, name)
-            )
+            part = scene.parts[row.reflector.part]
+            work = _work(scene, row.reflector, camera, name)
+            predicted = budget.predict(scene, part, name, row.pixels, row.settings, *work)
             reason = f"{reason}; for its virtual objects"
             row = dataclasses.replace(row, technique=name, reason=reason, predicted=predicted)
         rows.append(row)
@@ -248,6 +250,9 @@ def mirror_weight(scene: Scene, part: PartRange, settings: Settings) -> float:
     return 0.0
 
 
+# Triangles. Finding out what a larger mesh is (a quadric, convex sheets) takes seconds: `auto` leaves it where the outcome
+# is several sheets at best, or would lose against tracing even if it were one.
+ANALYSED_MAX = 20000
 PREVIEW_SIDE = 320  # pixels; enough to count a mirror's pixels within a few per cent for the choice of technique
 
 
@@ -276,7 +281,7 @@ def _row(scene, camera, settings, method, number, part_index, part, weight, pixe
     technique, forced, reason = _technique(scene, reflector, camera, method, pixels, settings, part, notes)
     if method == "reference":
         settings = settings.replace(refine="off")
-    predicted = budget.predict(scene, technique, pixels, settings, *_work(scene, reflector, camera, technique))
+    predicted = budget.predict(scene, part, technique, pixels, settings, *_work(scene, reflector, camera, technique))
     return PlanRow(
         reflector,
         part.prim_path,
@@ -310,13 +315,20 @@ def _technique(scene, reflector, camera, method, pixels, settings, part, notes) 
         notes.append(Note(part.prim_path, f"{method} does not apply ({reason}); traced"))
         return "raytraced", False, f"{method} was asked for but does not apply: {reason}"
     reasons = []
+    traced = budget.predict(scene, part, "raytraced", pixels, settings)["ms"]
     for name in PREFERRED:
+        least = budget.predict(scene, part, name, pixels, settings)["ms"]
+        if name != "planar" and part.triangle_count > ANALYSED_MAX and (traced < least or not reflector.convex):
+            reasons.append(
+                f"{part.triangle_count} triangles that are not convex together, or dearer to reflect than to trace, are "
+                f"not analysed by auto (at most {ANALYSED_MAX})"
+            )
+            break
         applies, reason = _applies(scene, reflector, camera, name)
         if not applies:
             reasons.append(f"{name}: {reason}")
             continue
-        forward = budget.predict(scene, name, pixels, settings, *_work(scene, reflector, camera, name))["ms"]
-        traced = budget.predict(scene, "raytraced", pixels, settings)["ms"]
+        forward = budget.predict(scene, part, name, pixels, settings, *_work(scene, reflector, camera, name))["ms"]
         if traced < forward:
             return (
                 "raytraced",
@@ -352,9 +364,7 @@ def _effects(scene, part, technique, pixels, weight, settings) -> dict[str, Effe
     return {
         "reflection": Effect(
             visible,
-            f"mirror weight {weight:.2f} {bound}, {pixels} pixels"
-            if visible
-            else "not seen from the camera",
+            f"mirror weight {weight:.2f} {bound}, {pixels} pixels" if visible else "not seen from the camera",
             {"weight": weight, "pixels": pixels},
         ),
         "refinement": Effect(

@@ -24,6 +24,10 @@ AS_GOOD = 1.5  # times the best residual
 ROUNDING = 2.0e-7  # of the size: what float32 points miss their own surface by
 
 
+SAMPLE = 4096  # points that decide the ten coefficients; more change them by less than their rounding
+HOPELESS_SINE = 0.2  # of a normal, 12 degrees: no picture of a mirror forgives it
+
+
 @dataclass(frozen=True)
 class Fit:
     """A quadric and how well it describes a mesh.
@@ -64,6 +68,14 @@ def fit_quadric(points: np.ndarray, normals: np.ndarray) -> Fit | None:
     normals = np.asarray(normals, np.float64)
     if len(points) < POINTS_MIN or not (np.isfinite(points).all() and np.isfinite(normals).all()):
         return None
+    best = _fitted(*(values[:: max(1, len(points) // SAMPLE)] for values in (points, normals)))
+    # The largest residual of all points is no smaller than that of some.
+    if best is None or best.sine > HOPELESS_SINE:
+        return best
+    return Fit(best.quadric, *_residuals(best.quadric, points, normals))
+
+
+def _fitted(points: np.ndarray, normals: np.ndarray) -> Fit | None:
     middle = points.mean(axis=0)
     spread, axes = np.linalg.eigh(np.cov((points - middle).T))
     if not spread[0] > FLATNESS**2 * spread[2]:
