@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import subprocess
@@ -456,7 +457,7 @@ def test_samples_of_other_topology_are_not_interpolated(stage, call):
     changing = 0
     for mesh in virtual_meshes(opened):
         times = mesh.GetPointsAttr().GetTimeSamples()
-        for a, b in zip(times, times[1:], strict=False):
+        for a, b in itertools.pairwise(times):
             index = [np.array(mesh.GetFaceVertexIndicesAttr().Get(t)) for t in (a, b)]
             if not np.array_equal(*index):
                 changing += 1
@@ -516,7 +517,7 @@ def test_failed_write_leaves_the_older_layer(stage, call, monkeypatch):
 
 
 def test_glb_holds_the_same_objects_in_metres(stage, call):
-    code, out, err = call(stage, "out.usda", "--glb", "out.glb")
+    code, _, err = call(stage, "out.usda", "--glb", "out.glb")
     assert code == 0, err
     opened = Usd.Stage.Open("out.usda")
     meshes = {str(mesh.GetPath()).removeprefix("/World/WarpReflect/"): mesh for mesh in virtual_meshes(opened)}

@@ -129,6 +129,10 @@ class RangeOptions:
     """rich, json (one object a line on standard error), alf (ALF_PROGRESS 50%) or none; rich on a terminal."""
     multi_part: Annotated[bool, Parameter(negative=())] = False
     """Write EXR with one part per channel group."""
+    boxes: str | None = None
+    """A .json file for the boxes of the objects seen in mirrors, in COCO's layout; with --frames its name holds ####."""
+    st_map: str | None = None
+    """An .exr file for where in the picture the points seen in mirrors appear directly (s right, t up); likewise."""
     print_job: str | None = None
     """Render nothing; print this command as a job for a render farm: openjd (Open Job Description)."""
 
@@ -216,6 +220,9 @@ def _job(stage, names, frames, aov, opened: StageOptions, planned: PlanOptions, 
     """The options of `render` as a `pipeline.Job`."""
     from warp_reflect.stage.frames import frame_name, has_frame_pattern, parse_frames, snapshot_name
 
+    sides = _sides(ranged)
+    kinds = (*(pipeline.PICTURE for _ in names), *sides)
+    names = [*names, *sides.values()]
     if not names:
         raise ValueError("no output given; add a file such as out.exr or out.png")
     settings = _settings(planned)
@@ -245,8 +252,18 @@ def _job(stage, names, frames, aov, opened: StageOptions, planned: PlanOptions, 
         method=planned.method,
         channels=channels,
         multi_part=ranged.multi_part,
+        kinds=kinds,
         snapshot=snapshot_name(names[0]),
     )
+
+
+def _sides(ranged: RangeOptions) -> dict[str, str]:
+    """Kind to name of the files that are asked for beside the pictures."""
+    asked = {pipeline.BOXES: ("--boxes", ranged.boxes, ".json"), pipeline.ST_MAP: ("--st-map", ranged.st_map, ".exr")}
+    for flag, name, ending in asked.values():
+        if name is not None and not name.lower().endswith(ending):
+            raise ValueError(f"{flag}: got '{name}', expected a name that ends in {ending}")
+    return {kind: name for kind, (_, name, _) in asked.items() if name is not None}
 
 
 def _part(text: str | None) -> tuple[int, int]:
@@ -267,6 +284,7 @@ def _print_job(kind, job, names, frames, aov, opened, planned, ranged) -> int:
     options = [*_as_tokens(opened), *_as_tokens(planned)]
     options += ["--aov", aov] if aov is not None else []
     options += ["--multi-part"] if ranged.multi_part else []
+    options += [each for kind, name in _sides(ranged).items() for each in ("--" + kind.replace("_", "-"), name)]
     print(json.dumps(openjd_template(job.stage, names, frames, len(job.times), options), indent=2))
     return DONE
 
@@ -392,6 +410,7 @@ def process(
     opened, planned = opened or StageOptions(), planned or PlanOptions()
     if opened.untrusted:
         raise ValueError("--untrusted: a stage is processed by opening it here; render it untrusted instead")
+    _, _, planned, notes = _as_the_stage_asks(stage, [out], "", opened, planned)
     settings = _settings(planned)
     _check_method(planned.method)
     _check_size_options(planned)
@@ -402,13 +421,14 @@ def process(
         times,
         load=_load_options(opened, planned, settings) | {"device": _open_device(opened.device)},
         camera=planned.camera,
-        width=planned.image_width,
+        width=planned.image_width or WIDTH_DEFAULT,
         size=_size(planned.res) if planned.res is not None else None,
         settings=settings,
         method=planned.method,
     )
     wish = processing.Wish(clip, purpose, glb or "")
     with reporting(progress) as report:
+        report.notes(notes)
         return processing.run(
             job, wish, report, resume=resume, seconds=timelimit, strict=opened.strict, debug=opened.debug
         )

@@ -23,15 +23,18 @@ import traceback
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
 import warp_reflect as wr
-from warp_reflect import images
+from warp_reflect import images, seen
 from warp_reflect.progress import Report, statistics_line
 
 KEY = "warp_reflect:key"  # header entry: what the frame was made from, see `frame_key`
 DONE, PART_WAY, IMPOSSIBLE = 0, 1, 2
+# What a file of a frame holds: the frame, boxes of the objects seen in mirrors (`seen`), or where they are seen directly.
+KINDS = PICTURE, BOXES, ST_MAP = "picture", "boxes", "st_map"
 # What a stage, a disk or a device can do to one frame; anything else is a fault of this program and ends the range.
 FRAME_FAILURES = (ValueError, LookupError, ArithmeticError, OSError, RuntimeError, MemoryError)
 # How a stage is opened that says nothing about what its frames show.
@@ -61,6 +64,7 @@ class Job:
         multi_part: EXR of one part per channel group.
         numbers: The frames' places in the whole range; empty: this is the whole range.
         folder: What relative names are relative to.
+        kinds: What each of a frame's files holds, of `KINDS`; empty: all are pictures.
         snapshot: Where a picture of the last finished frame is written when asked for by a signal.
     """
 
@@ -76,6 +80,7 @@ class Job:
     channels: tuple[str, ...] | None = None
     multi_part: bool = False
     numbers: tuple[int, ...] = ()
+    kinds: tuple[str, ...] = ()
     folder: str = field(default_factory=os.getcwd)
     snapshot: str = "snapshot.png"
 
@@ -106,10 +111,15 @@ class Job:
             place -= 1
         return max(place - 1, 0) if self.looks_back else place
 
+    def outputs(self, place: int) -> list[tuple[str, str]]:
+        """(file, kind) of a frame."""
+        names = self.files[place]
+        return list(zip(names, self.kinds or (PICTURE,) * len(names), strict=True))
+
     @property
     def looks_back(self) -> bool:
         """Whether a frame depends on the one before: through its motion channel, or by reusing what that one found."""
-        data = any(name.lower().endswith(".exr") for name in self.files[0])
+        data = any(kind == PICTURE and name.lower().endswith(".exr") for name, kind in self.outputs(0))
         asked = self.channels is None or any(name.startswith("reflectionMotion") for name in self.channels)
         return self.reuses or (data and asked)
 
@@ -242,9 +252,15 @@ def is_done(job: Job, place: int, digest: str) -> bool:
     """Whether every file of a frame is there, whole to the last pixel, and was made from the same."""
     key = frame_key(job, place, digest)
     try:
-        return all(images.check_whole(name).get(KEY) == key for name in job.files[place])
+        return all(_key_of(name, kind) == key for name, kind in job.outputs(place))
     except OSError:
         return False
+
+
+def _key_of(name: str, kind: str) -> object:
+    from warp_reflect.seen import read_boxes
+
+    return (read_boxes(name)["info"] if kind == BOXES else images.check_whole(name)).get(KEY)
 
 
 @contextlib.contextmanager
@@ -351,8 +367,16 @@ def _render(opened: OpenJob, place: int, digest: str) -> Outcome:
     frame = opened.render(place)
     rendered_ms = 1000.0 * (time.perf_counter() - start)
     attributes = {KEY: frame_key(job, place, digest)}
-    for name in job.files[place]:
-        frame.write(name, list(job.channels) if job.channels else None, attributes, job.multi_part)
+    for name, kind in job.outputs(place):
+        if kind == PICTURE:
+            frame.write(name, list(job.channels) if job.channels else None, attributes, job.multi_part)
+        elif kind == ST_MAP:
+            seen.write_st_map(name, frame, attributes)
+        else:
+            number = (job.numbers[place] if job.numbers else place) + 1
+            picture = next((each for each, other in job.outputs(place) if other == PICTURE), "")
+            relative = os.path.relpath(picture, os.path.dirname(name) or ".") if picture else ""
+            seen.write_boxes(name, seen.coco_boxes(frame, number, relative, attributes))
     width, height = frame.camera.size
     notes = tuple((note.path, note.text) for note in [*frame.scene.notes, *frame.plan.notes])
     text = f"{width}x{height}, {rendered_ms:.0f} ms{statistics_line(frame.statistics)}"
@@ -397,10 +421,14 @@ def run(
         ValueError, OSError: the stage, the camera or the outputs cannot be used, or the cluster cannot be reached.
     """
     from warp_reflect.stage.identity import stage_digest
+    from warp_reflect.stage.write import check_place
 
     deadline = None if seconds is None else time.time() + seconds
-    for name in {name for row in job.files[:1] for name in row}:
-        images.check_writable(name)
+    for name, kind in dict.fromkeys(job.outputs(0)):
+        if kind == BOXES:
+            check_place(Path(name))
+        else:
+            images.check_writable(name)
     report.busy(f"reading {job.stage}")
     digest = stage_digest(job.stage, job.load.get("root", ""), job.load.get("untrusted", False))
     places = list(part_of(len(job.times), part))
