@@ -579,3 +579,33 @@ def test_frames_outside_of_the_range_are_noted(stage, call):
     code, _, err = call(stage, "out.usda", "-f", "4:5")
     assert code == 0
     assert "1 of 2 frames lie outside of its time codes 1 to 4" in err
+
+
+def test_hidden_mirrors_and_their_virtual_objects_make_the_same_picture(stage, call):
+    """Rendered as real geometry, where the mirrors are hidden: the same prims at the same pixels, in their own colours."""
+    assert call(stage, "out.usda", "--clip", "--purpose", "render", "--method", "auto")[0] == 0
+    layer = Sdf.Layer.CreateNew("view.usda")
+    layer.subLayerPaths.append("./out.usda")
+    layer.defaultPrim = "World"
+    for mirror in ("/World/Ball", "/World/Wall"):
+        Sdf.AttributeSpec(
+            Sdf.CreatePrimInLayer(layer, mirror), "visibility", Sdf.ValueTypeNames.Token
+        ).default = "invisible"
+    layer.Save()
+    size = (160, 120)
+    real, virtual = (wr.load_stage(name) for name in (stage, "view.usda"))
+    expected = wr.render_frame(real, wr.make_plan(real, size=size, method="reference"))
+    frame = wr.render_frame(virtual, wr.make_plan(virtual, size=size, method="reference"))
+    opened = Usd.Stage.Open("view.usda")
+    source_of = {str(mesh.GetPath()): sources(mesh.GetPrim())[1] for mesh in virtual_meshes(opened)}
+    number = {path: k for k, path in real.prims.items()}
+    own = np.zeros(len(virtual.prims) + 1)
+    for k, path in virtual.prims.items():
+        own[k] = number[source_of.get(path, path).removesuffix("/Half")]
+    shown = own[frame["primId"].astype(int)]
+    mirror = expected["reflectorId"] > 0
+    wanted = np.where(mirror, expected["reflectedId"], expected["primId"])
+    inner = interior(expected["reflectorId"]) & interior(wanted)
+    assert (mirror & inner & (wanted > 0)).sum() > 300
+    np.testing.assert_array_equal(shown[inner & ~mirror], wanted[inner & ~mirror])
+    assert (shown == wanted)[inner & mirror].mean() > 0.995

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import json
 import sys
 from pathlib import Path
@@ -252,3 +253,18 @@ def test_device_arrays_are_the_channels_without_a_copy(device):
         assert np.from_dlpack(motion).__array_interface__["data"][0] == motion.ptr
     with pytest.raises(KeyError, match=r"N\.X"):
         frame.device_array("N.X")
+
+
+def test_simulator_loop_measures_the_mirrors_motion(capsys):
+    """Of a sphere moved sideways by d the image of what is far moves by d, as its centre does."""
+    path = Path(__file__).resolve().parents[1] / "tools" / "moving_mirror.py"
+    spec = importlib.util.spec_from_file_location("moving_mirror", path)
+    example = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(example)
+    frame = example.main(steps=2)
+    told = capsys.readouterr().out.splitlines()
+    assert "up to 0.00 px" in told[0]
+    motion = frame["reflectionMotion"][..., 0][frame["reflectedId"] > 0]
+    centre = frame.scene.data.instances[0].world_from_object[:3, 3] - frame.camera.eye
+    expected = 0.02 * frame.camera.fx / (centre @ frame.camera.forward)
+    assert 0.3 * expected < np.median(motion) < 1.5 * expected

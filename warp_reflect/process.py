@@ -108,6 +108,8 @@ def run(
     layer = VirtualLayer.open(job.stage, path, provenance, wish.purpose, resume)
     places = [place for place, code in enumerate(job.times) if code not in layer.times]
     kept = len(job.times) - len(places)
+    if resume and not kept and path.exists():
+        report.line(f"resume: {path} has none of the frames, or is of another stage or other options; made anew")
     if kept:
         report.line(f"resume: {kept:,} of {len(job.times):,} frames are done")
     report.begin(len(places))
