@@ -294,7 +294,14 @@ def read_image(
     """
     if color_space not in ("auto", "sRGB", "raw"):
         raise ValueError(f"color_space: got '{color_space}', expected auto, sRGB or raw")
-    path = Path(path)
+    try:
+        return _read_picture(Path(path), color_space, size_limit_mb, signed)
+    except MemoryError:
+        # Below the limit as stored, one-bit samples take many times that as floats.
+        raise OSError(f"{path}: cannot be read: not enough memory for its size") from None
+
+
+def _read_picture(path: Path, color_space: str, size_limit_mb: int, signed: bool) -> Picture:
     pixels, spec = _read(path, size_limit_mb)
     names = [name.upper() for name in spec.channelnames]
     if not set("RGB") <= set(names):

@@ -12,7 +12,7 @@ from warp_reflect.scene import CameraData, InstanceData, MaterialData, MeshData,
 from warp_reflect.stage.cameras import default_camera
 from warp_reflect.stage.detail import pixels_across, subdivision_level
 from warp_reflect.stage.geometry import SMOOTH_SCHEMES, read_gprim, read_mesh, subdivision_scheme
-from warp_reflect.stage.intake import BadPrim, Intake, floats, library_message, transform_fault
+from warp_reflect.stage.intake import BadPrim, Intake, floats, integers, library_message, transform_fault
 from warp_reflect.stage.lights import mesh_light_radiance
 from warp_reflect.stage.materials import MaterialTable, Surface
 from warp_reflect.stage.points import read_points
@@ -185,8 +185,11 @@ class Assembly:
         return points.min(axis=0), points.max(axis=0)
 
     def _level(self, prim, box: Box, worlds: np.ndarray, mirror: bool, camera: CameraData) -> int:
-        counts = UsdGeom.Mesh(prim).GetFaceVertexCountsAttr().Get(self.intake.time)
-        return subdivision_level(len(counts or ()), mirror, pixels_across(*box, worlds, camera))
+        try:
+            counts = integers(UsdGeom.Mesh(prim).GetFaceVertexCountsAttr(), self.intake.time)
+        except BadPrim:
+            return 0  # told when the mesh is read
+        return subdivision_level(0 if counts is None else len(counts), mirror, pixels_across(*box, worlds, camera))
 
     def _is_mirror(self, prim, surfaces: list[Surface | None]) -> bool:
         for target, surface in zip(targets(prim), surfaces, strict=True):

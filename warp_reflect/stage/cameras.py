@@ -25,14 +25,17 @@ def read_camera(prim, world_from_camera: np.ndarray, intake: Intake) -> CameraDa
         raise BadPrim(fault)
     camera = UsdGeom.Camera(prim)
     projection = token(camera.GetProjectionAttr(), intake.time, ("perspective", "orthographic"))
-    clipping = camera.GetClippingRangeAttr().Get(intake.time)
+    clipping = np.array(camera.GetClippingRangeAttr().Get(intake.time))
+    if clipping.dtype.kind not in "fiu" or clipping.shape != (2,):
+        raise BadPrim(f"clippingRange: got {clipping.tolist()!r}, expected two numbers")
     near, far = (float(v) for v in clipping)
     if not (np.isfinite(near) and far > near and (near > 0.0 or projection == "orthographic")):
         raise BadPrim(f"clippingRange: got ({near:g}, {far:g}), expected 0 < near < far")
     planes = camera.GetClippingPlanesAttr().Get(intake.time)
     if planes is not None and len(planes):
         intake.note(prim.GetPath(), f"clippingPlanes: {len(planes)} planes are not used")
-    if (camera.GetFStopAttr().Get(intake.time) or 0.0) > 0.0:
+    f_stop = camera.GetFStopAttr().Get(intake.time)
+    if isinstance(f_stop, float) and f_stop > 0.0:
         intake.note(prim.GetPath(), "fStop: depth of field is not simulated")
     perspective = projection == "perspective"
     return CameraData(

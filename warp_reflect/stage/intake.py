@@ -129,8 +129,12 @@ def token(attribute: Usd.Attribute, time: Usd.TimeCode, allowed: tuple[str, ...]
 
 def library_message(fault: Tf.ErrorException) -> str:
     """The innermost message of the library's error list as one line, without positions in its source."""
-    messages = re.findall(r" : '(.*?)'\s*(?:$|\n\s*Error in)", str(fault), flags=re.DOTALL)
-    return " ".join((messages[0] if messages else str(fault)).split())
+    try:
+        text = str(fault)
+    except UnicodeDecodeError as quoted:  # the message quotes a file that is not UTF-8
+        text = quoted.object.decode(errors="backslashreplace")
+    messages = re.findall(r" : '(.*?)'\s*(?:$|\n\s*Error in)", text, flags=re.DOTALL)
+    return " ".join((messages[0] if messages else text).split())
 
 
 def column_matrix(matrix) -> np.ndarray:

@@ -13,6 +13,9 @@ from pxr import Ar, Sdf, Tf
 
 from warp_reflect.stage.guard import Limits, UnknownFormat, check_file, confinement_fault
 
+# Prims placed by instances may outnumber those composed, and the walk stops at its own count; far beyond it the walk
+# would only take its time to refuse (2 M prims: 100 s).
+PLACED_SHARE = 100
 LIST_OPERATIONS = ("explicitItems", "prependedItems", "appendedItems", "addedItems")
 
 
@@ -88,6 +91,7 @@ def _composed_prims(layers: _Layers, root: Sdf.Layer, limits: Limits) -> int:
     """
     start = (root.identifier, "/")
     counts: dict[tuple[str, str], int] = {}
+    placed: dict[tuple[str, str], int] = {}  # the same with what instances share counted for each
     arcs: dict[tuple[str, str], int] = {}  # the longest chain of references from a prim on
     waiting: list[tuple[tuple[str, str], bool]] = [(start, False)]
     below: dict[tuple[str, str], list[tuple[tuple[str, str], bool, bool]]] = {}
@@ -95,9 +99,10 @@ def _composed_prims(layers: _Layers, root: Sdf.Layer, limits: Limits) -> int:
     while waiting:
         node, ready = waiting.pop()
         if ready:
-            total, longest = 1, 0
+            total, everywhere, longest = 1, 1, 0
             for child, is_arc, instanced in below.pop(node):
                 longest = max(longest, is_arc + arcs.get(child, 0))
+                everywhere += max(placed.get(child, 0) - is_arc, 0)
                 if instanced:
                     shared.add(child)
                 else:
@@ -105,10 +110,15 @@ def _composed_prims(layers: _Layers, root: Sdf.Layer, limits: Limits) -> int:
             if longest > limits.arcs:
                 raise ValueError(f"<{node[1]}> in {node[0]}: more than {limits.arcs} references one behind the other")
             counts[node], arcs[node] = min(total, 2 * limits.prims), longest
+            placed[node] = min(everywhere, 2 * PLACED_SHARE * limits.prims)
         elif node not in counts and node not in below:  # else known, or a cycle, which composition refuses
             below[node] = list(_below(layers, *node, limits))
             waiting.append((node, True))
             waiting.extend((child, False) for child, _, _ in below[node])
+    if placed[start] > PLACED_SHARE * limits.prims:
+        raise ValueError(
+            f"{root.identifier}: would place {placed[start]} prims, more than {PLACED_SHARE * limits.prims}"
+        )
     return counts[start] + sum(counts.get(node, 0) for node in shared)
 
 
@@ -124,6 +134,8 @@ def _below(layers: _Layers, identifier: str, path: str, limits: Limits) -> Itera
         if Sdf.Path(path).pathElementCount > limits.depth:
             raise ValueError(f"<{path}> in {identifier}: deeper than {limits.depth} levels")
         for child in spec.nameChildren:
+            if child is None:
+                raise ValueError(f"<{path}> in {identifier}: a child that is listed and not there; the file is damaged")
             yield (identifier, str(child.path)), False, False
         if path == "/":
             continue

@@ -118,7 +118,8 @@ class Walk:
             local, resets = self.transforms.GetLocalTransformation(prim)
             world = column_matrix(local)
             if not resets:
-                world = state.world_from_parent @ world
+                with np.errstate(invalid="ignore", over="ignore"):  # told by `transform_fault` where something is drawn
+                    world = state.world_from_parent @ world
             elif state.inside_instancer:
                 self.intake.note(prim.GetPath(), "xformOpOrder: !resetXformStack! stops at the point instancer")
             state = State(world, visible, purpose, state.inside_instancer)
