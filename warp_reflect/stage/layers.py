@@ -115,11 +115,12 @@ def _composed_prims(layers: _Layers, root: Sdf.Layer, limits: Limits) -> int:
             below[node] = list(_below(layers, *node, limits))
             waiting.append((node, True))
             waiting.extend((child, False) for child, _, _ in below[node])
-    if placed[start] > PLACED_SHARE * limits.prims:
+    total = counts[start] + sum(counts.get(node, 0) for node in shared)
+    if total <= limits.prims and placed[start] > PLACED_SHARE * limits.prims:
         raise ValueError(
             f"{root.identifier}: would place {placed[start]} prims, more than {PLACED_SHARE * limits.prims}"
         )
-    return counts[start] + sum(counts.get(node, 0) for node in shared)
+    return total
 
 
 def _below(layers: _Layers, identifier: str, path: str, limits: Limits) -> Iterator[tuple[tuple[str, str], bool, bool]]:
