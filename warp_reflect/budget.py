@@ -55,9 +55,9 @@ def predict(
         forward += pixels * ((1.0 - held) * TRACE_US + OWN_BODY_US)
     if branches:
         forward += vertices * BRANCHES_US + pixels * OWN_BODY_US
-    if settings.refine == "exact":
+    if settings.refine != "off":
         forward += pixels * (REFINE_US + DOUBT_SHARE * TRACE_US)
     bytes_ = passes * 6 * settings.map_resolution**2 * 32 if technique == "reflector_map" else 0
     # Straight virtual edges between exact vertices: the papers' picture is wrong by about a pixel at silhouettes.
-    error = 0.0 if settings.refine == "exact" else 1.0
+    error = 0.0 if settings.refine != "off" else 1.0
     return {"error_px": error, "ms": 1e-3 * forward / threads, "bytes": bytes_}

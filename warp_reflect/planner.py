@@ -368,7 +368,7 @@ def _effects(scene, part, technique, pixels, weight, settings) -> dict[str, Effe
             {"weight": weight, "pixels": pixels},
         ),
         "refinement": Effect(
-            visible and not traced and settings.refine == "exact",
+            visible and not traced and settings.refine != "off",
             "traced rays are exact already" if traced else f"refine={settings.refine}",
         ),
         "warm_start": Effect(

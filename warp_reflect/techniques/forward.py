@@ -46,7 +46,7 @@ MAX_ITERATIONS = wp.constant(int(Status.MAX_ITERATIONS))
 SKY = wp.constant(int(Status.SKY))
 # Bisections of an edge at the hidden boundary: 1/4096 of its length, below a pixel, or, where refinement finds the exact
 # hit anyway, a candidate close enough to walk from.
-BOUNDARY_STEPS = {"off": 12, "exact": 5}
+BOUNDARY_STEPS = {"off": 12, "exact": 5, "strict": 5}
 
 
 @dataclass
@@ -207,7 +207,7 @@ def reflect(
         wary: The solver's surface is not quite the mirror's own, see `refine.settle`.
 
     Returns:
-        The layer; with `refine="exact"` every pixel is the hit of an exact ray-triangle test.
+        The layer; unless `refine="off"` every pixel is the hit of an exact ray-triangle test.
     """
     layer = ReflectionLayer.empty(pixels, technique, scene.device)
     if pixels.count == 0:
@@ -248,7 +248,7 @@ def reflect(
     with timer("virtual_raster"):
         target = raster.make_target(gbuffer.view, pixels.box, scene.device, gbuffer.reflector_id, reflector.id)
         target.view.painter = int(settings.occlusion == "painter")
-        if settings.refine == "exact":
+        if settings.refine != "off":
             raster.attach_rays(target, gbuffer.view, pixels, settings.threads)
         drawn = raster.rasterise(target, vertices.screen, mesh.triangles, points=mesh.points, threads=settings.threads)
         straddling, failed = _draw_straddling(scene, mesh, target, frame, vertices, solve_boundary, gbuffer, settings)

@@ -259,7 +259,7 @@ def settle(
             pixels.direction,
             blocked,
         ]
-        + [settings.walk_hops, int(trust_sky), int(wary)]
+        + [settings.walk_hops, int(trust_sky), int(wary or settings.refine == "strict")]
         + [layer.triangle, layer.u, layer.v, layer.distance, layer.status, settled],
         scene.device,
         settings.threads,

@@ -394,6 +394,7 @@ def reflect(
         settings,
         history,
         prepared.map.view.greatest_curvature,
+        wary=not prepared.map.closed,  # near its rim a sheet map feels the companion
     )
     layer.statistics.update(statistics)
     return layer
