@@ -358,6 +358,7 @@ class SearchSettings:
     method: int  # SEARCH_MIDPOINT, else Newton
     iterations: int
     tolerance: float
+    accepted: float  # residual up to which an answer has a picture, where the map asks for less
 
 
 @wp.func
@@ -403,8 +404,9 @@ def solve_vertex(
             # boundary's bisection ends at the vertex itself, where virtual and real point coincide.
             grazing = wp.min(r.cos_eye, r.cos_target) < GRAZING_COS
             status = wp.where(grazing, HIDDEN, wp.where(closing, UNREFLECTED, MAX_ITERATIONS))
-            out_vertex.status[i] = wp.uint8(status)
-            return
+            if status != MAX_ITERATIONS or r.residual > settings.accepted:
+                out_vertex.status[i] = wp.uint8(status)
+                return
         # A crease sharper than the texels: drawn near its place, refinement walks from there, but nothing beside it is
         # trusted to be sky.
         status = wp.where(closing, CONVERGED, MAX_ITERATIONS)
@@ -429,4 +431,6 @@ def search_settings(settings: Settings, resolution: int) -> SearchSettings:
     result.method = int(SEARCH_MIDPOINT) if midpoint else 0
     result.iterations = settings.iterations or (MIDPOINT_ITERATIONS if midpoint else NEWTON_EVALUATIONS)
     result.tolerance = settings.tolerance or default_tolerance(resolution)
+    # Whoever bounds the midpoint search and refines nothing asks for the picture of so many steps, as the paper shows it.
+    result.accepted = 1.0 if midpoint and settings.iterations and settings.refine == "off" else 0.0
     return result
