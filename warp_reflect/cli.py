@@ -1,4 +1,4 @@
-"""The `warp-reflect` command: `plan`, `render`, `bake`, `process`, `compare`.
+"""The `warp-reflect` command: `plan`, `render`, `bake`, `process`, `sweep`, `compare`.
 
 Results go to standard output, notes and errors to standard error. Exit 0: done; 1: a job failed part way;
 2: cannot be done, with one line that says why; 130, 143: stopped by SIGINT, SIGTERM.
@@ -432,6 +432,72 @@ def process(
         return processing.run(
             job, wish, report, resume=resume, seconds=timelimit, strict=opened.strict, debug=opened.debug
         )
+
+
+@app.command
+def sweep(
+    stage: str,
+    folder: str,
+    /,
+    *,
+    camera: Annotated[str | None, Parameter(name=["--camera", "-cam"])] = None,
+    image_width: Annotated[int, Parameter(name=["--imageWidth", "-w"])] = 960,
+    res: str | None = None,
+    rounds: int = 7,
+    only: str | None = None,
+    threads: int = 0,
+    opened: StageOptions | None = None,
+    mirrors: MirrorOptions | None = None,
+) -> int:
+    """Measure what accuracy costs: every technique and setting, its error beside its time, as JSON, CSV, PNG and a page.
+
+    Args:
+        stage: A USD file.
+        folder: Where results.json, results.csv, pareto.png, contact.png and report.html are written.
+        camera: Path or name of a camera.
+        image_width: Width in pixels; the height follows from the camera's aspect.
+        res: Exact size instead, WIDTHxHEIGHT.
+        rounds: Timed frames of each contender.
+        only: Contenders to measure, comma-separated: techniques (quadric), settings (grid_share, refine=off), names or
+            patterns (Estalella*).
+        threads: CPU threads; 0: one per core.
+        opened: How the stage is opened.
+        mirrors: What is a mirror, and settings that all contenders share.
+    """
+    opened, mirrors = opened or StageOptions(), mirrors or MirrorOptions()
+    planned = PlanOptions(camera, image_width, res, "reference", mirrors.reflector, mirrors.set_, mirrors.complexity)
+    settings = _settings(planned).replace(threads=threads)
+    _check_size_options(planned)
+    if rounds < 1:
+        raise ValueError(f"--rounds: got {rounds}, expected 1 or more")
+    device = _open_device(opened.device)
+
+    from warp_reflect import sweep as sweeping
+    from warp_reflect.sweep_report import open_folder, write_sweep
+
+    open_folder(folder)
+    with reporting(None) as report:
+
+        def tell(text: str) -> None:
+            report.busy(text)
+            if report.style != "rich":
+                report.line(text)
+
+        tell("reading " + stage)
+        scene = _load(stage, opened, planned, settings, device, None)
+        reference = _make_plan(scene, planned, settings)
+        contenders, notes = sweeping.default_contenders(scene, reference.camera, reference.size, settings)
+        if only is not None:
+            contenders = sweeping.choose(contenders, [name.strip() for name in only.split(",") if name.strip()])
+        measured = sweeping.run_sweep(scene, reference.camera, reference.size, contenders, rounds, tell)
+        measured.notes[:0] = notes
+        written = write_sweep(measured, folder)
+        report.notes([*scene.notes, *((stage, text) for text in [*measured.notes, *written.notes])])
+        for text in measured.failed:
+            report.line(f"error: {text}")
+    for file in written.files:
+        print(file)
+    return PART_WAY if measured.failed else DONE
 
 
 @app.command
