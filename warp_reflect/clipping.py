@@ -29,11 +29,11 @@ def clip_to_mask(corners: np.ndarray, mask: np.ndarray, near: float) -> tuple[np
     low, high = np.full((len(corners), 2), -np.inf), np.full((len(corners), 2), np.inf)
     pixel = corners[ahead][..., :2] / corners[ahead][..., 2:]
     low[ahead], high[ahead] = pixel.min(axis=1), pixel.max(axis=1)
-    inside = _is_covered(mask, low, high)
+    inside, beside = _coverage(mask, low, high)
     owners, weights = [np.repeat(np.flatnonzero(inside), 3)], [np.tile(np.eye(3), (int(inside.sum()), 1))]
     triangles = [np.arange(3 * int(inside.sum())).reshape(-1, 3)]
     points = 3 * int(inside.sum())
-    crossing = np.flatnonzero(~inside & (corners[..., 2] > near).any(axis=1))
+    crossing = np.flatnonzero(~inside & ~beside & (corners[..., 2] > near).any(axis=1))
     step = max(PAIRS_MAX // max(len(boxes), 1), 1)
     for first in range(0, len(crossing), step):
         some = crossing[first : first + step]
@@ -72,16 +72,21 @@ def rectangles(mask: np.ndarray) -> np.ndarray:
     return np.stack([start[first], row[first], end[first], row[last] + 1], axis=1).astype(int)
 
 
-def _is_covered(mask: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Whether all pixels that a box touches belong to the mask, bool [n]; boxes float64 [n, 2], corners in pixels."""
+def _coverage(mask: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Whether all pixels that a box touches belong to the mask, and whether none does, bool [n] each.
+
+    Args:
+        mask: bool [height, width].
+        low, high: Corners of the boxes, float64 [n, 2]. [pixels]
+    """
     height, width = mask.shape
     total = np.zeros((height + 1, width + 1), np.int64)
     total[1:, 1:] = mask.cumsum(axis=0).cumsum(axis=1)
-    whole = ((low >= 0.0) & (high <= [width, height])).all(axis=1)
-    x0, y0 = np.floor(np.where(whole[:, None], low, 0.0)).astype(int).T
-    x1, y1 = np.ceil(np.where(whole[:, None], high, 0.0)).astype(int).T
+    x0, y0 = np.floor(np.clip(low, 0.0, [width, height])).astype(int).T
+    x1, y1 = np.ceil(np.clip(high, 0.0, [width, height])).astype(int).T
     count = total[y1, x1] - total[y0, x1] - total[y1, x0] + total[y0, x0]
-    return whole & (count == (x1 - x0) * (y1 - y0))
+    whole = ((low >= 0.0) & (high <= [width, height])).all(axis=1)
+    return whole & (count == (x1 - x0) * (y1 - y0)), count == 0
 
 
 def _clip(corners: np.ndarray, boxes: np.ndarray, near: float) -> tuple[np.ndarray, np.ndarray]:
