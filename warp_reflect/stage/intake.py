@@ -127,11 +127,16 @@ def token(attribute: Usd.Attribute, time: Usd.TimeCode, allowed: tuple[str, ...]
     return str(value)
 
 
-def library_message(fault: Tf.ErrorException) -> str:
-    """The innermost message of the library's error list as one line, without positions in its source."""
+def library_message(fault: Tf.ErrorException | UnicodeDecodeError) -> str:
+    """The innermost message of the library's error list as one line, without positions in its source.
+
+    A UnicodeDecodeError comes from the library where a name or text of a file is not UTF-8.
+    """
+    if isinstance(fault, UnicodeDecodeError):
+        return f"a text that is not UTF-8: {fault.object.decode(errors='backslashreplace')}"
     try:
         text = str(fault)
-    except UnicodeDecodeError as quoted:  # the message quotes a file that is not UTF-8
+    except UnicodeDecodeError as quoted:  # the message quotes such a text
         text = quoted.object.decode(errors="backslashreplace")
     messages = re.findall(r" : '(.*?)'\s*(?:$|\n\s*Error in)", text, flags=re.DOTALL)
     return " ".join((messages[0] if messages else text).split())

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pxr import Ar, Sdf, Tf
 
 from warp_reflect.stage.guard import Limits, UnknownFormat, check_file, confinement_fault
+from warp_reflect.stage.intake import library_message
 
 # Prims placed by instances may outnumber those composed, and the walk stops at its own count; far beyond it the walk
 # would only take its time to refuse (2 M prims: 100 s).
@@ -33,7 +34,10 @@ def check_layers(path: str, limits: Limits) -> None:
     root = layers.open(path)
     if root is None:
         return  # told by whoever opens the stage
-    total = _composed_prims(layers, root, limits)
+    try:
+        total = _composed_prims(layers, root, limits)
+    except (Tf.ErrorException, UnicodeDecodeError) as fault:  # a damaged file fails where it is looked at
+        raise ValueError(f"cannot read {path}: {library_message(fault)}") from None
     if total > limits.prims:
         raise ValueError(f"{path}: would compose to {total} prims, more than {limits.prims}")
 

@@ -107,7 +107,7 @@ class StageReader:
         try:
             with quiet():
                 data = self._read(time, intake)
-        except Tf.ErrorException as fault:
+        except (Tf.ErrorException, UnicodeDecodeError) as fault:
             raise ValueError(f"cannot read {self.path}: {library_message(fault)}") from None
         data.notes = intake.notes
         self._first = self._first or data
