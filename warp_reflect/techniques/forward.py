@@ -47,6 +47,7 @@ SKY = wp.constant(int(Status.SKY))
 # Bisections of an edge at the hidden boundary: 1/4096 of its length, below a pixel, or, where refinement finds the exact
 # hit anyway, a candidate close enough to walk from.
 BOUNDARY_STEPS = {"off": 12, "exact": 5, "strict": 5}
+DENSE = 2.0  # virtual triangles per mirror pixel: from here on a pixel hides nearer ones that only a strict look finds
 
 
 @dataclass
@@ -272,6 +273,7 @@ def reflect(
             blocked = wp.zeros(0, dtype=wp.uint8, device=scene.device)
             if not reflector.convex:
                 blocked = bvh.own_obstacles(scene, gbuffer, pixels, reflector.part, settings.threads)
+        wary = wary or drawn > DENSE * pixels.count
         with timer("refine"):
             doubtful = refine.settle(
                 scene, gbuffer, pixels, target, mesh, layer, blocked, settings, trust_sky=failed == 0, wary=wary
