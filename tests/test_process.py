@@ -16,8 +16,10 @@ from pxr import Sdf, Usd, UsdGeom, UsdShade, UsdValidation
 from rooms import plane_room, render
 
 import warp_reflect as wr
-from warp_reflect import cli, process
+from warp_reflect import cli, pipeline, process
 from warp_reflect.clipping import clip_to_mask, rectangles
+from warp_reflect.stage.glb import write_glb
+from warp_reflect.stage.write_virtual import Place, VirtualLayer, VirtualSample, place_name
 
 SCENES = Path(__file__).resolve().parents[1] / "usd_scenes"
 # Errors of the law of reflection at the mirror's points of virtual vertices, most of them grazing. float32 virtual points;
@@ -618,3 +620,60 @@ def test_hidden_mirrors_and_their_virtual_objects_make_the_same_picture(stage, c
     assert (mirror & inner & (wanted > 0)).sum() > 300
     np.testing.assert_array_equal(shown[inner & ~mirror], wanted[inner & ~mirror])
     assert (shown == wanted)[inner & mirror].mean() > 0.995
+
+
+def sample(points: np.ndarray, triangles: list, source: str = "/World/Box") -> VirtualSample:
+    index = np.array(triangles, np.int32)
+    return VirtualSample(Place("/World/Ball"), Place(source), 0, "quadric", points, index, (0.5, 0.5, 0.5))
+
+
+def test_samples_are_interpolated_where_the_topology_stays_and_nowhere_else(stage):
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    one, other = [[0, 1, 2], [0, 2, 3]], [[0, 1, 3], [1, 2, 3]]
+    layer = VirtualLayer.open(stage, Path("out.usda"), {"key": "k"}, "render", resume=False)
+    for time, triangles in ((1.0, one), (4.0, other), (2.0, one), (3.0, other)):  # in no order
+        layer.add(time, np.zeros(3), [sample(points + time, triangles)])
+    layer.save()
+    opened = Usd.Stage.Open("out.usda")
+    (mesh,) = virtual_meshes(opened)
+    for time, expected in ((1.5, 1.5), (2.0, 2.0), (2.5, 2.0), (3.0, 3.0), (3.5, 3.5)):
+        np.testing.assert_allclose(np.array(mesh.GetPointsAttr().Get(time))[:4], points + expected, atol=1e-6)
+    assert validation_errors("out.usda") == []
+
+
+def test_names_of_different_places_differ():
+    paths = [
+        "/World/A/B",
+        "/World/A__B",
+        "/World/A",
+        "/World/A/_B",
+        "/World/A_/B",
+        "/A/B",
+        "/World/World/A",
+        "/World/Å",
+    ]
+    places = [Place(path) for path in paths]
+    places += [Place("/World/A", instance=each) for each in ("2", "12", "1/2", "inner 2")]
+    places += [Place("/World/A", subset="C"), Place("/World/A__2")]
+    for parent in ("/", "/World"):
+        names = [place_name(each, parent) for each in places]
+        assert len(set(names)) == len(names)
+        assert all(Sdf.Path.IsValidIdentifier(name) for name in names)
+
+
+def test_glb_of_a_z_up_stage_in_centimetres_is_y_up_in_metres(tmp_path):
+    points, origin = np.array([[0.0, 0, 0], [1, 0, 0], [0, 2, 3]]), np.array([1.0e6, -20.0, 30.0])
+    write_glb(tmp_path / "out.glb", [("M", "A", points, np.array([[0, 1, 2]]), (0.2, 0.4, 0.6))], origin, "Z", 0.01)
+    scene = trimesh.load(tmp_path / "out.glb", force="scene")
+    transform, geometry = scene.graph["M/A"]
+    loaded = trimesh.transform_points(scene.geometry[geometry].vertices, transform)
+    world = points + origin
+    np.testing.assert_allclose(loaded, 0.01 * np.stack([world[:, 0], world[:, 2], -world[:, 1]], 1), rtol=1e-7)
+
+
+def test_layer_that_another_run_writes_is_left_to_it(stage, call):
+    with pipeline.claimed(["out.usda"]):
+        code, _, err = call(stage, "out.usda")
+    assert code == 2
+    assert "another process is writing it" in err
+    assert not Path("out.usda").exists()

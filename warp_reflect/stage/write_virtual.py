@@ -237,9 +237,8 @@ class VirtualLayer:
         return str(material.GetPath())
 
     def _name(self, place: Place) -> str:
-        """A prim name that no other place has: the path below the scope's parent, its steps joined by two underscores."""
         if place not in self._names:
-            self._names[place] = _place_name(place, str(self._scope.GetParentPath()))
+            self._names[place] = place_name(place, str(self._scope.GetParentPath()))
         return self._names[place]
 
     def _write(self, prim: Sdf.PrimSpec, time: float | None, sample: VirtualSample) -> None:
@@ -332,7 +331,8 @@ def _free_name(stage: Usd.Stage, parent: Sdf.Path) -> str:
     return name
 
 
-def _place_name(place: Place, parent: str) -> str:
+def place_name(place: Place, parent: str) -> str:
+    """A prim name for a place that no other place has: its path below `parent`, steps joined by two underscores."""
     below = parent.rstrip("/") + "/"
     inside = place.path.startswith(below)
     steps = place.path[len(below) :].split("/") if inside else ["", *place.path.strip("/").split("/")]
