@@ -364,7 +364,7 @@ def run_sweep(
             contenders.remove(contender)
             continue
         if contender.name == REFERENCE:
-            pivot = _mirrors_middle(frame)
+            pivot = mirrors_middle(frame)
             if pivot is None:
                 result.notes.append("no mirror is seen from the camera: nothing to compare")
                 return result
@@ -609,7 +609,7 @@ def _loaded_modules() -> set[str]:
     return {kernel.module.name for kernel in kernels if kernel.module.execs}
 
 
-def _mirrors_middle(frame: Frame) -> np.ndarray | None:
+def mirrors_middle(frame: Frame) -> np.ndarray | None:
     """World position in the middle of what is seen of the mirrors; None where nothing is."""
     points = frame.relative("mirrorPoint")[frame["status"] > 0]
     return frame.camera.eye + np.median(points.astype(np.float64), axis=0) if len(points) else None

@@ -18,7 +18,7 @@ from warp_reflect.sweep import REFERENCE, Row, Sweep, pareto
 
 # Not in the table: too long for a cell, or a picture.
 NESTED = ("settings", "statistics", "steps_ms", "picture", "error_map")
-SHOWN_MAX = 16  # pictures of the contact sheet
+SHOWN_MAX = 20  # pictures of the contact sheet
 ERROR_SHOWN_PX = 2.0  # at which the error map's colour ends
 COLOURS = {
     "raytraced": "#333333",
@@ -119,10 +119,12 @@ def table_csv(sweep: Sweep) -> str:
 
 def label(row: Row) -> str:
     """A row's name without what goes without saying."""
-    return row.name.replace("reflector_map ", "map ").replace("explosion_map ", "explosion ").replace("=exact", "")
+    return (
+        row.name.replace("reflector_map ", "map ").replace("explosion_map ", "explosion ").replace(" refine=exact", "")
+    )
 
 
-def worst_first(sweep: Sweep) -> list[Row]:
+def shown_rows(sweep: Sweep) -> list[Row]:
     """The rows that the contact sheet shows: the reference, those on the frontier, and the papers' settings."""
     front = {row.name for row in frontier(sweep, off_share)}
     named = [row for row in sweep.rows if row.name == REFERENCE]
@@ -244,7 +246,7 @@ def _spread(wanted: np.ndarray, step: float) -> np.ndarray:
     places = np.clip(wanted, 0.03, 0.98)
     for k in range(1, len(places)):
         places[k] = max(places[k], places[k - 1] + step)
-    places -= max(places[-1] - 0.98, 0.0)
+    places[-1] = min(places[-1], 0.98)
     for k in range(len(places) - 2, -1, -1):
         places[k] = min(places[k], places[k + 1] - step)
     return places
@@ -257,7 +259,7 @@ def contact_png(sweep: Sweep) -> bytes:
     from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
 
-    rows = worst_first(sweep)
+    rows = shown_rows(sweep)
     columns = min(4, len(rows))
     bands = -(-len(rows) // columns)
     height, width = rows[0].picture.shape[:2]
