@@ -19,6 +19,8 @@ from warp_reflect.settings import Status
 from warp_reflect.techniques import virtual_mesh
 from warp_reflect.techniques.vertices import VertexView
 
+# Vertices: the corners of a box are searched from nothing, which costs as much as some thirty vertices of the last frame.
+WORTH = 128
 # Corners solved per vertex of the scene at most: beyond it the boxes cost more than they can save.
 CORNER_SHARE = 0.1
 # An edge's picture bends by (length / reach)^2 radians where the estimate holds; it is trusted up to here, twice over.
@@ -45,7 +47,7 @@ def settle_culled(
     Returns:
         How many vertices.
     """
-    first, count, corners = scene.boxes
+    first, count, corners = (values[scene.boxes[1] >= WORTH] for values in scene.boxes)
     if not 0 < 8 * len(first) <= CORNER_SHARE * scene.vertex_count:
         return 0
     solved = solve(wp.array(corners.reshape(-1, 3).astype(np.float32), dtype=wp.vec3, device=scene.device))
