@@ -30,6 +30,8 @@ __all__ = list(_HOME)
 
 
 def __getattr__(name: str):
+    if name == "viewer":  # needs pyvista: not among the names that `*` would import
+        return import_module("warp_reflect.viewer")
     if name not in _HOME:
         raise AttributeError(f"module 'warp_reflect' has no attribute '{name}'")
     value = getattr(import_module(f"warp_reflect.{_HOME[name]}"), name)

@@ -1,4 +1,4 @@
-"""The `warp-reflect` command: `plan`, `render`, `bake`, `process`, `sweep`, `compare`.
+"""The `warp-reflect` command: `plan`, `render`, `bake`, `process`, `view`, `sweep`, `compare`.
 
 Results go to standard output, notes and errors to standard error. Exit 0: done; 1: a job failed part way;
 2: cannot be done, with one line that says why; 130, 143: stopped by SIGINT, SIGTERM.
@@ -498,6 +498,64 @@ def sweep(
     for file in written.files:
         print(file)
     return PART_WAY if measured.failed else DONE
+
+
+@Parameter(name="*")
+@dataclass
+class ViewOptions:
+    """What is shown, without a window where a file is named."""
+
+    screenshot: str | None = None
+    """Write the inspector's view to a PNG."""
+    frame_only: Annotated[bool, Parameter(negative=())] = False
+    """With --screenshot: the frame alone, which needs no OpenGL."""
+    turntable: str | None = None
+    """Write a full turn about the mirror to a GIF, or to numbered files such as out.####.png."""
+    frames: int = 36
+    """Of the turntable."""
+    html: str | None = None
+    """Write a page that needs nothing else: frame, reference, error map, numbers, plan."""
+    time: float | None = None
+    """Time code to begin at."""
+    pick: Annotated[list[str] | None, Parameter(negative=())] = None
+    """A pixel X,Y to ask; repeatable."""
+
+
+@app.command
+def view(
+    stage: str,
+    /,
+    *,
+    shown: ViewOptions | None = None,
+    opened: StageOptions | None = None,
+    planned: PlanOptions | None = None,
+) -> int:
+    """Inspect a stage: live frames beside the reference, the error in pixels, rays and virtual objects in space.
+
+    Args:
+        stage: A USD file.
+        shown: What is shown.
+        opened: How the stage is opened.
+        planned: What is simulated, and how.
+    """
+    from warp_reflect.viewer import command
+
+    shown, opened, planned = shown or ViewOptions(), opened or StageOptions(), planned or PlanOptions()
+    settings = _settings(planned)
+    _check_method(planned.method)
+    _check_size_options(planned)
+    command.check(shown)
+    device = _open_device(opened.device)
+    with reporting(None) as report:
+        report.busy("reading " + stage)
+        scene = _load(stage, opened, planned, settings, device, shown.time)
+        report.busy("rendering")
+        size = _size(planned.res) if planned.res is not None else None
+        session = command.make_session(scene, planned.camera, settings, planned.method, size, planned.image_width)
+        report.notes([*scene.notes, *session.plan.notes])
+        for text in command.run(session, shown, print):
+            report.line(text)
+    return DONE
 
 
 @app.command
