@@ -16,10 +16,9 @@ import argparse
 import sys
 from pathlib import Path
 
-import warp as wp
-
 import warp_reflect as wr
 from warp_reflect import sweep
+from warp_reflect.devices import open_device
 
 SCENES = Path(__file__).resolve().parents[1] / "usd_scenes"
 # Section 7, frames a second of the whole picture by share of vertices searched.
@@ -32,6 +31,7 @@ LAGES_MIGUEL_FPS = {
 }
 LAGES_MIGUEL_TRACED_S = 12.0  # figure 5's reference, by a rendering engine
 REUSES_PX = (0.25, 0.5, 1.0)
+STEP_RADIANS = 0.002  # a slow walk about the mirrors, which keeping vertices is for
 
 
 def parse() -> argparse.Namespace:
@@ -45,7 +45,7 @@ def parse() -> argparse.Namespace:
 
 def main() -> None:
     arguments = parse()
-    wp.config.quiet = True
+    open_device("cpu")  # quietly
     size = tuple(int(side) for side in arguments.size.split("x"))
     for paper in arguments.paper or PAPERS:
         print("\n".join(PAPERS[paper](size, arguments.rounds, arguments.threads)), flush=True)
@@ -53,6 +53,10 @@ def main() -> None:
 
 def measured(name: str, size: tuple[int, int], contenders: list, rounds: int) -> sweep.Sweep:
     """A sweep over a scene of `usd_scenes`, told of on standard error."""
+
+    def tell(text: str) -> None:
+        print(f"{name}: {text}", file=sys.stderr)
+
     scene = wr.load_stage(SCENES / f"{name}.usda")
     return sweep.run_sweep(
         scene, None, size, contenders, rounds, lambda text: print(f"{name}: {text}", file=sys.stderr)

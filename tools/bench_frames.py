@@ -28,6 +28,7 @@ import numpy as np
 import warp as wp
 
 from warp_reflect import sweep
+from warp_reflect.devices import open_device
 from warp_reflect.launch import thread_count
 from warp_reflect.sweep import Embree, commit
 
@@ -57,7 +58,7 @@ def parse() -> argparse.Namespace:
 
 def main() -> None:
     arguments = parse()
-    wp.config.quiet = True
+    open_device(arguments.device)  # quietly
     width, height = (int(side) for side in arguments.size.split("x"))
     rows = []
     measure, show = (bench, table)

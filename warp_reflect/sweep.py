@@ -152,6 +152,7 @@ class Sweep:
     camera: str
     size: tuple[int, int]
     rounds: int
+    step_radians: float
     threads: int
     triangles: int
     vertices: int
@@ -308,6 +309,7 @@ def run_sweep(
     contenders: list[Contender] | None = None,
     rounds: int = 7,
     report: Callable[[str], None] | None = None,
+    step: float = STEP_RADIANS,
 ) -> Sweep:
     """Measure contenders side by side.
 
@@ -319,6 +321,7 @@ def run_sweep(
         contenders: None: `default_contenders`. A reference with the first one's threads is added where there is none.
         rounds: Timed frames of each.
         report: Told what is being done, a line at a time.
+        step: Of the camera from round to round: what is kept from frame to frame depends on it. [radians]
 
     Returns:
         A `Sweep`; without rows, and with a note, where no mirror is seen.
@@ -340,6 +343,7 @@ def run_sweep(
         camera=view.path,
         size=view.size,
         rounds=rounds,
+        step_radians=step,
         threads=threads,
         triangles=scene.triangle_count,
         vertices=scene.vertex_count,
@@ -370,7 +374,7 @@ def run_sweep(
                 return result
             embree = Embree.over(spare, frame, result.notes)
     del spare, frame
-    poses = camera_path(view, pivot, rounds + 1)
+    poses = camera_path(view, pivot, rounds + 1, step)
     rows, plans, last, spent = {}, {}, {}, {each.name: [] for each in contenders}
     for contender in contenders:
         told(f"first frame: {contender.name}")
