@@ -178,6 +178,22 @@ def alhazen_points(eye: np.ndarray, target: np.ndarray, side: float) -> np.ndarr
     return np.array(found).reshape(-1, 3)
 
 
+def sphere_points(centre: np.ndarray, eye: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Reflection points outside unit spheres, [n, 3], and the cosines of incidence, by bisection in the plane of incidence."""
+    a, b = eye - centre, target - centre
+    e1 = a / np.linalg.norm(a, axis=1, keepdims=True)
+    across = b - np.einsum("ij,ij->i", b, e1)[:, None] * e1
+    e2 = across / np.linalg.norm(across, axis=1, keepdims=True)
+    low, high = np.zeros(len(a)), np.arctan2(np.linalg.norm(across, axis=1), np.einsum("ij,ij->i", b, e1))
+    for _ in range(60):
+        angle = 0.5 * (low + high)
+        n = np.cos(angle)[:, None] * e1 + np.sin(angle)[:, None] * e2
+        cosines = [np.einsum("ij,ij->i", n, (x - n) / np.linalg.norm(x - n, axis=1, keepdims=True)) for x in (a, b)]
+        ahead = cosines[0] > cosines[1]
+        low, high = np.where(ahead, angle, low), np.where(ahead, high, angle)
+    return centre + n, cosines[0]
+
+
 def scanned_points(name: str, eye: np.ndarray, target: np.ndarray, side: float, nodes: int = 160) -> np.ndarray:
     """Every reflection point on a unit-frame surface by a dense scan of the path length's slope, [k, 3].
 

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from oracles import sphere_points
 from rooms import identical, placed, plane_room, render, room, sphere
 
 import warp_reflect as wr
@@ -22,22 +23,6 @@ def pixel_of(camera, points):
     return np.stack(
         [camera.cx + camera.fx * (p @ camera.right) / depth, camera.cy - camera.fy * (p @ camera.up) / depth], 1
     )
-
-
-def sphere_reflection(centre, eye, target):
-    """Reflection points on unit spheres by bisection in the plane of incidence, float64."""
-    a, b = eye - centre, target - centre
-    e1 = a / np.linalg.norm(a, axis=1, keepdims=True)
-    across = b - np.einsum("ij,ij->i", b, e1)[:, None] * e1
-    e2 = across / np.linalg.norm(across, axis=1, keepdims=True)
-    low, high = np.zeros(len(a)), np.arctan2(np.linalg.norm(across, axis=1), np.einsum("ij,ij->i", b, e1))
-    for _ in range(60):
-        angle = 0.5 * (low + high)
-        n = np.cos(angle)[:, None] * e1 + np.sin(angle)[:, None] * e2
-        cosines = [np.einsum("ij,ij->i", n, (x - n) / np.linalg.norm(x - n, axis=1, keepdims=True)) for x in (a, b)]
-        ahead = cosines[0] > cosines[1]
-        low, high = np.where(ahead, angle, low), np.where(ahead, high, angle)
-    return centre + n, cosines[0]
 
 
 def moved(scene, path, offset):
@@ -60,7 +45,7 @@ def errors(now, before, centre_before, offsets=None):
     if offsets is not None:
         target = target - offsets[now["reflectedId"][seen].astype(int)]
     eye = np.broadcast_to(before.camera.eye, target.shape)
-    r, cosine = sphere_reflection(np.broadcast_to(centre_before, target.shape), eye, target)
+    r, cosine = sphere_points(np.broadcast_to(centre_before, target.shape), eye, target)
     expected = np.stack([x + 0.5, y + 0.5], 1) - pixel_of(before.camera, r)
     away = cosine > 0.15
     assert away.sum() > 800

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import warp as wp
+from oracles import sphere_points
 from rooms import identical, placed, plane_room, render, room, sphere
 
 import warp_reflect as wr
@@ -24,23 +25,10 @@ def rate_kernel(
 
 
 def unit_sphere_virtual(eye, target):
-    """Virtual vertices by bisection of the law of reflection in the plane of incidence, float64 (unit sphere at 0)."""
-    e1 = eye / np.linalg.norm(eye, axis=1, keepdims=True)
-    across = target - np.einsum("ij,ij->i", target, e1)[:, None] * e1
-    e2 = across / np.linalg.norm(across, axis=1, keepdims=True)
-    full = np.arctan2(np.linalg.norm(across, axis=1), np.einsum("ij,ij->i", target, e1))
-    low, high = np.zeros(len(eye)), full.copy()
-    for _ in range(60):
-        angle = 0.5 * (low + high)
-        n = np.cos(angle)[:, None] * e1 + np.sin(angle)[:, None] * e2
-        o = (eye - n) / np.linalg.norm(eye - n, axis=1, keepdims=True)
-        v = (target - n) / np.linalg.norm(target - n, axis=1, keepdims=True)
-        ahead = np.einsum("ij,ij->i", n, o) > np.einsum("ij,ij->i", n, v)
-        low, high = np.where(ahead, angle, low), np.where(ahead, high, angle)
-    to_mirror = n - eye
-    legs = np.linalg.norm(to_mirror, axis=1), np.linalg.norm(target - n, axis=1)
-    cosine = np.einsum("ij,ij->i", n, (eye - n) / legs[0][:, None])
-    return eye + to_mirror * (1.0 + legs[1] / legs[0])[:, None], cosine
+    """Virtual vertices in the unit sphere at the origin, float64."""
+    point, cosine = sphere_points(np.zeros(3), eye, target)
+    legs = np.linalg.norm(point - eye, axis=1), np.linalg.norm(target - point, axis=1)
+    return eye + (point - eye) * (1.0 + legs[1] / legs[0])[:, None], cosine
 
 
 def test_drift_rate_bounds_how_far_virtual_vertices_move_on_the_screen():
