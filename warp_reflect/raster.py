@@ -349,7 +349,8 @@ def cull_kernel(
     a = screen[corners[0]]
     b = screen[corners[1]]
     c = screen[corners[2]]
-    if a[2] < 0.0 or b[2] < 0.0 or c[2] < 0.0:
+    # Dropped vertices, and those that are not a number: no comparison holds for them.
+    if not (a[2] >= 0.0 and b[2] >= 0.0 and c[2] >= 0.0):
         return
     if needs_clipping(a) or needs_clipping(b) or needs_clipping(c):
         if a[3] < target.near and b[3] < target.near and c[3] < target.near:
