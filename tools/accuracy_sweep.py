@@ -31,7 +31,6 @@ LAGES_MIGUEL_FPS = {
 }
 LAGES_MIGUEL_TRACED_S = 12.0  # figure 5's reference, by a rendering engine
 REUSES_PX = (0.25, 0.5, 1.0)
-STEP_RADIANS = 0.002  # a slow walk about the mirrors, which keeping vertices is for
 
 
 def parse() -> argparse.Namespace:

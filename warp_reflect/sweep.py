@@ -51,8 +51,11 @@ REUSES_PX = (0.25, 0.5, 1.0)
 FORWARD = ("planar", "quadric", "reflector_map", "explosion_map")
 SEARCHED = ("reflector_map",)
 KEEPING = ("quadric", "reflector_map")  # keep virtual vertices from frame to frame
-# Of the camera about the mirrors' middle, per frame: a walker's step at 30 frames a second, some metres away.
-STEP_RADIANS = 0.01
+# Of the camera about the mirrors' middle, per frame: a slow walk some metres away. What is kept from frame to frame is
+# kept for such; a brisk one (0.01) leaves little of it.
+STEP_RADIANS = 0.002
+FLIP_MARGIN = 16  # pixels about the mirrors; FLIP's filters reach 10 at 67 pixels a degree
+CPU = "cpu"  # among a frame's timings, beside its stages
 CROP_SIDE = 640  # pixels of a row's picture, above which it is shrunk
 RAY_STEP = 1.0e-4  # of the scene's size, along the normal: Embree's rays must not meet their own facet
 VERSIONS = ("warp-lang", "numpy", "usd-core", "embreex", "flip-evaluator", "matplotlib")
@@ -95,6 +98,8 @@ class Row:
     reflect_p95_ms: float = 0.0
     frame_ms: float = 0.0
     frame_p95_ms: float = 0.0
+    frame_cpu_ms: float = 0.0
+    """Processor time of the whole frame, all threads together: hardly changes when others use the machine."""
     first_ms: float = 0.0
     """The first frame, preparation included, once all kernels are loaded."""
     prepare_ms: float = 0.0
@@ -393,8 +398,9 @@ def run_sweep(
         turned = 1 + (np.arange(len(contenders) - 1) + round_) % max(len(contenders) - 1, 1)
         for contender in [contenders[0], *(contenders[k] for k in turned)]:
             name = contender.name
+            started = time.process_time()
             frame = render_frame(scene, plans[name], poses[round_], last.get(name))
-            spent[name].append(frame.timings)
+            spent[name].append(frame.timings | {CPU: 1000.0 * (time.process_time() - started)})
             if contender.warm:
                 last[name] = frame
             if round_ == rounds:
@@ -449,7 +455,7 @@ def pareto(rows: Iterable[Row], cost: Callable[[Row], float], error: Callable[[R
 
 def frame_ms(timings: dict[str, float]) -> float:
     """Milliseconds of a frame's outermost stages, without preparation."""
-    return sum(ms for step, ms in timings.items() if "/" not in step and step != "prepare")
+    return sum(ms for step, ms in timings.items() if "/" not in step and step not in ("prepare", CPU))
 
 
 class Embree:
@@ -643,7 +649,8 @@ def _take_times(row: Row, spent: list[dict[str, float]]) -> None:
     whole = [frame_ms(timings) for timings in spent]
     row.reflect_ms, row.frame_ms = statistics.median(reflect), statistics.median(whole)
     row.reflect_p95_ms, row.frame_p95_ms = float(np.percentile(reflect, 95)), float(np.percentile(whole, 95))
-    steps = dict.fromkeys(step for timings in spent for step in timings if step != "prepare")
+    row.frame_cpu_ms = statistics.median(timings[CPU] for timings in spent)
+    steps = dict.fromkeys(step for timings in spent for step in timings if step not in ("prepare", CPU))
     row.steps_ms = {step: statistics.median(timings.get(step, 0.0) for timings in spent) for step in steps}
 
 
@@ -667,8 +674,9 @@ def _judge(row: Row, frame: Frame, reference: Frame, result: Sweep) -> None:
     row.psnr_db = found.psnr_db
     pictures = [np.ascontiguousarray(each["RGBA"][..., :3]) for each in (reference, frame)]
     mirror = found.classes != PixelClass.NONE
-    seen = flip(*pictures)
-    row.flip = None if seen is None else float(seen[mirror].mean())
+    near = _around(mirror, FLIP_MARGIN)
+    seen = flip(pictures[0][near], pictures[1][near])
+    row.flip = None if seen is None else float(seen[mirror[near]].mean())
     counts = frame.statistics
     row.statistics = {name: float(value) for name, value in counts.items()}
     row.bvh_share = counts.get("bvh", 0) / max(np.count_nonzero(frame["reflectorId"]), 1)
@@ -691,10 +699,15 @@ def _angles_deg(mine: dict, true: dict, where: np.ndarray) -> np.ndarray:
     return np.degrees(np.arctan2(sine, np.einsum("ij,ij->i", a, b)))
 
 
+def _around(where: np.ndarray, margin: int) -> tuple[slice, slice]:
+    """The rows and columns of a mask's bounding box, widened."""
+    rows, columns = np.nonzero(where.any(axis=1))[0], np.nonzero(where.any(axis=0))[0]
+    return tuple(slice(max(each[0] - margin, 0), each[-1] + 1 + margin) for each in (rows, columns))
+
+
 def _crops(picture: np.ndarray, found: Comparison, mirror: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The mirrors' part of a picture and of its errors, at most `CROP_SIDE` pixels a side (means and maxima)."""
-    rows, columns = np.nonzero(mirror.any(axis=1))[0], np.nonzero(mirror.any(axis=0))[0]
-    part = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    part = _around(mirror, 0)
     error = np.where(mirror, found.error_px, np.nan)
     # Nothing is known of the border's errors; what shows another thing is off by any distance.
     error[found.classes == PixelClass.BORDER] = np.nan

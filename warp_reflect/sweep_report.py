@@ -37,6 +37,7 @@ COLUMNS = (
     ("reflect_p95_ms", ".1f", "p95"),
     ("predicted_ms", ".1f", "predicted"),
     ("frame_ms", ".1f", "frame ms"),
+    ("frame_cpu_ms", ".1f", "frame CPU ms"),
     ("first_ms", ".0f", "first frame"),
     ("prepare_ms", ".0f", "prepare"),
     ("compile_ms", ".0f", "compile"),
@@ -154,6 +155,8 @@ def pareto_png(sweep: Sweep) -> bytes:
     )
     for axes, (error, title, least) in zip(figure.subplots(1, 2), panels, strict=True):
         _draw_panel(axes, sweep, error, title, least)
+    handles, names = axes.get_legend_handles_labels()
+    figure.legend(handles, names, fontsize=8, loc="outside lower center", ncols=6)
     machine = sweep.machine
     figure.suptitle(
         f"{Path(sweep.stage).name}, {sweep.size[0]}x{sweep.size[1]}, {sweep.triangles:,} triangles, "
@@ -216,7 +219,6 @@ def _draw_panel(axes, sweep: Sweep, error: Callable[[Row], float], title: str, l
     )
     named = {row.name: row for row in [*front, *(row for row in rows if row.source)]}
     _write_names(axes, [(label(row), row.reflect_ms, max(error(row), least)) for row in named.values()])
-    axes.legend(fontsize=8, loc="lower left", bbox_to_anchor=(0.0, 0.04))
 
 
 def _write_names(axes, places: list[tuple[str, float, float]]) -> None:
