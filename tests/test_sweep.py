@@ -219,6 +219,32 @@ def test_command_writes_and_reports(tmp_path, capsys):
     assert [row["name"] for row in rows] == [sweep.REFERENCE, sweep.OFEK, "quadric refine=off"]
 
 
+def test_command_goes_on_without_a_contender_that_fails(tmp_path, capsys, monkeypatch):
+    whole = sweep.render_frame
+
+    def short_of_memory(scene, plan, *rest, **more):
+        if plan.method == "explosion_map":
+            raise MemoryError("no room for a map")
+        return whole(scene, plan, *rest, **more)
+
+    monkeypatch.setattr(sweep, "render_frame", short_of_memory)
+    tokens = [
+        "sweep",
+        str(STAGE),
+        str(tmp_path),
+        "--res",
+        "48x27",
+        "--rounds",
+        "1",
+        "--only",
+        "quadric refine=off,Ofek*",
+    ]
+    assert cli.main(tokens) == 1
+    assert f"error: {sweep.OFEK}: no room for a map" in capsys.readouterr().err.splitlines()
+    told = json.loads((tmp_path / "results.json").read_text())
+    assert [row["name"] for row in told["rows"]] == [sweep.REFERENCE, "quadric refine=off"] and len(told["failed"]) == 1
+
+
 def test_command_says_that_nothing_mirrors(tmp_path, capsys):
     stage = tmp_path / "dull.usda"
     stage.write_text(EMPTY)

@@ -332,7 +332,8 @@ def run_sweep(
         A `Sweep`; without rows, and with a note, where no mirror is seen.
 
     Raises:
-        ValueError: an unknown camera, an impossible size, no rounds, or two contenders of one name.
+        ValueError: an unknown camera, an impossible size, no rounds, or two contenders of one name. What another contender
+            than the reference raises before its first frame is done is told in `Sweep.failed`; the others go on.
     """
     if rounds < 1:
         raise ValueError(f"rounds: got {rounds}, expected 1 or more")
@@ -369,6 +370,8 @@ def run_sweep(
                 render_frame(spare, frame.plan, previous=frame)
             loading[contender.name] = 1000.0 * (time.perf_counter() - start) if _loaded_modules() != before else 0.0
         except (ValueError, NotImplementedError, MemoryError) as error:
+            if contender.name == REFERENCE:
+                raise
             result.failed.append(f"{contender.name}: {error}")
             contenders.remove(contender)
             continue
