@@ -220,7 +220,9 @@ def test_impossible_values_are_told_and_the_prim_stays_as_it_is(stage, values, m
 def test_attributes_of_another_type_are_told(stage):
     prim = samples.add_quad(stage, "/Quad").GetPrim()
     prim.AddAppliedSchema(MIRROR_API)
-    prim.CreateAttribute("warp_reflect:include", Sdf.ValueTypeNames.String).Set("no")
+    # As a spec: a stage holds authors to the schema's types once the schema is registered in the process.
+    spec = stage.GetRootLayer().GetPrimAtPath("/Quad")
+    Sdf.AttributeSpec(spec, "warp_reflect:include", Sdf.ValueTypeNames.String).default = "no"
     assert any("warp_reflect:include: got 'no', expected a bool" in t for t in notes(read_stage(samples.saved(stage))))
 
 
