@@ -18,6 +18,7 @@ CLEARCOAT_MIN = 0.5  # a coat from here on is a mirror of its own (design: clear
 PREFERRED = ("planar", "quadric", "reflector_map")  # the exact and cheap first
 JUDGED_IN_PIXELS = ("quadric",)  # whether they apply depends on the view
 METHODS = ("auto", "reference")
+REUSING = ("quadric", "reflector_map")  # know a bound on how far a virtual vertex drifts
 REC709_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 DEFAULT_SIZE = (960, 540)  # usdrecord's default width at 16:9
 
@@ -314,6 +315,8 @@ def _technique(scene, reflector, camera, method, pixels, settings, part, notes) 
             return method, True, f"asked for; {reason}"
         notes.append(Note(part.prim_path, f"{method} does not apply ({reason}); traced"))
         return "raytraced", False, f"{method} was asked for but does not apply: {reason}"
+    if pixels == 0:
+        return "raytraced", False, "not seen from the plan's camera: nothing is done, and rays serve another camera"
     reasons = []
     traced = budget.predict(scene, part, "raytraced", pixels, settings)["ms"]
     for name in PREFERRED:
@@ -370,6 +373,16 @@ def _effects(scene, part, technique, pixels, weight, settings) -> dict[str, Effe
         "refinement": Effect(
             visible and not traced and settings.refine != "off",
             "traced rays are exact already" if traced else f"refine={settings.refine}",
+        ),
+        "grid": Effect(
+            visible and technique == "reflector_map" and (settings.grid_share > 0.0 or settings.max_error_px > 0.0),
+            f"grid_share={settings.grid_share:g}, max_error_px={settings.max_error_px:g}"
+            if technique == "reflector_map"
+            else "only reflector maps are interpolated",
+        ),
+        "reuse": Effect(
+            visible and technique in REUSING and settings.reuse_px > 0.0,
+            f"reuse_px={settings.reuse_px:g}" if technique in REUSING else "no search that could be left out",
         ),
         "warm_start": Effect(
             visible and not traced, "no search" if traced else "from the previous frame where one is given"
