@@ -69,9 +69,9 @@ def solve_plane_kernel(
         return
     r = target - h_target * normal
     if h_target > target_noise:
-        # Heights add: no cancellation. R is a weighted mean of the two feet.
-        t = h_target / (h_eye + h_target)
-        r = t * (eye - h_eye * normal) + (wp.float64(1.0) - t) * r
+        # Heights add: no cancellation, nor in 1 - t, which a far target would multiply. R is a weighted mean of the feet.
+        total = h_eye + h_target
+        r = (h_target / total) * (eye - h_eye * normal) + (h_eye / total) * r
     status = CONVERGED
     if half_width > wp.float64(0.0):
         if wp.abs(wp.dot(r, width_axis)) > half_width or wp.abs(wp.dot(r, height_axis)) > half_height:
