@@ -324,6 +324,18 @@ def test_traced_mirrors_get_virtual_objects_and_their_own_mesh(ball_room):
     assert np.allclose(mirror.field_data["origin"], ball_room.origin)
 
 
+def test_virtual_objects_of_a_mirror_together_are_the_same(ball_room):
+    plan = wr.make_plan(ball_room, size=SIZE, method="quadric")
+    apart = geometry.meshes(plan)
+    whole = geometry.meshes(plan, apart=False)["virtual /mirror"]
+    single = [mesh for name, mesh in apart.items() if name.startswith("virtual /mirror ")]
+    assert len(single) > 3 and whole.n_cells == sum(mesh.n_cells for mesh in single)
+    for name in ("rgb", "triangle"):
+        assert np.array_equal(whole.cell_data[name], np.concatenate([mesh.cell_data[name] for mesh in single]))
+    corners = [mesh.points[mesh.regular_faces].reshape(-1, 3) for mesh in single]
+    assert np.array_equal(whole.points[whole.regular_faces].reshape(-1, 3), np.concatenate(corners))
+
+
 def test_rays_go_by_the_mirror_to_the_point(ball_room):
     session = Session(ball_room, size=SIZE, method="quadric")
     rows, columns = np.nonzero(session.frame["reflectedId"] > 0)

@@ -34,7 +34,9 @@ class Region(IntEnum):
     UNREFLECTED = 3
 
 
-def meshes(plan: Plan, frame: Frame | None = None, picks: Sequence[Pick] = ()) -> dict[str, pv.PolyData]:
+def meshes(
+    plan: Plan, frame: Frame | None = None, picks: Sequence[Pick] = (), *, apart: bool = True
+) -> dict[str, pv.PolyData]:
     """A planned view as meshes.
 
     They lie in the scene frame: world axes with the origin at `origin` (field data, float64 [3]), so that single precision
@@ -44,6 +46,7 @@ def meshes(plan: Plan, frame: Frame | None = None, picks: Sequence[Pick] = ()) -
         plan: From `make_plan`. Mirrors that it traces, where a forward technique could answer, get virtual objects, too.
         frame: Of that plan; its camera is the eye. None: the plan's camera.
         picks: From `Session.pick`.
+        apart: A mesh for each virtual object; else `virtual PATH`, all of a mirror's as one, which is much faster.
 
     Returns:
         Name to mesh:
@@ -65,11 +68,16 @@ def meshes(plan: Plan, frame: Frame | None = None, picks: Sequence[Pick] = ()) -
     for row in plan.rows:
         found["mirror " + names[row.reflector.id]] = _mirror_mesh(scene, row, colors)
     objects = virtual_objects(scene, camera, layers)
-    for each in objects:
+    if not apart:
+        for row in plan.rows:
+            own = [each for each in objects if each.reflector == row.reflector.id]
+            if own:
+                found["virtual " + names[row.reflector.id]] = _virtual_mesh(scene, camera, own, colors)
+    for each in objects if apart else []:
         name = f"virtual {names[each.reflector]} {scene.prims[scene.parts[each.part].prim]}"
         name += f" piece {each.piece}" if each.piece else ""
         subset = scene.parts[each.part].subset
-        found[f"{name}:{subset}" if subset else name] = _virtual_mesh(scene, camera, each, colors)
+        found[f"{name}:{subset}" if subset else name] = _virtual_mesh(scene, camera, [each], colors)
     for row in plan.rows:
         own = [each for each in objects if each.reflector == row.reflector.id]
         if own:
@@ -168,12 +176,17 @@ def _mirror_mesh(scene: Scene, row: PlanRow, colors: np.ndarray) -> pv.PolyData:
     return mesh
 
 
-def _virtual_mesh(scene: Scene, camera: Camera, found: VirtualObject, colors: np.ndarray) -> pv.PolyData:
-    mesh = _poly(found.points + (camera.eye - scene.origin), found.triangles)
+def _virtual_mesh(scene: Scene, camera: Camera, objects: list[VirtualObject], colors: np.ndarray) -> pv.PolyData:
+    firsts = np.cumsum([0] + [len(each.points) for each in objects[:-1]])
+    points = np.concatenate([each.points for each in objects]) + (camera.eye - scene.origin)
+    triangles = np.concatenate([each.triangles + first for each, first in zip(objects, firsts, strict=True)])
+    mesh = _poly(points, triangles)
     if mesh.n_cells:
-        mesh.cell_data["rgb"] = np.tile(colors[found.part], (mesh.n_cells, 1))
-        mesh.cell_data["triangle"] = found.parents
-        mesh.point_data["source"] = found.sources
+        mesh.cell_data["rgb"] = np.repeat(
+            colors[[each.part for each in objects]], [len(each.triangles) for each in objects], axis=0
+        )
+        mesh.cell_data["triangle"] = np.concatenate([each.parents for each in objects])
+        mesh.point_data["source"] = np.concatenate([each.sources for each in objects])
     return mesh
 
 

@@ -125,7 +125,7 @@ class Inspector:
         self._heat = heat_map(session.comparison)
         if self.meshes:
             self.draw(*FLAT)
-        self.meshes = geometry.meshes(session.plan, session.frame, session.picks)
+        self.meshes = geometry.meshes(session.plan, session.frame, session.picks, apart=False)
         self._fill_space()
         self.draw()
 
