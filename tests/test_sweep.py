@@ -164,6 +164,15 @@ def test_frontier_holds_what_no_faster_row_equals():
     assert [row.name for row in front] == ["a", "b", "c"]
 
 
+def test_a_row_that_shows_nothing_right_has_no_displacement():
+    """One Newton step converges nowhere: everything is off, and that is no displacement of 0."""
+    settings = Settings(search="newton", iterations=1, refine="off", threads=1)
+    lost = sweep.Contender("lost", "reflector_map", settings)
+    row = sweep.run_sweep(wr.load_stage(ROOT / "usd_scenes" / "one_mirror.usda"), None, SIZE, [lost], 1).row("lost")
+    assert row.off_share == 1.0
+    assert row.error_mean_px is None and row.error_max_px is None
+
+
 def test_held_bytes_count_each_array_once():
     data = np.zeros(1000, np.float32)
     assert sweep.held_bytes([data, data[:], {"not walked": 1}, (np.zeros(8, np.uint8),)]) == 4008

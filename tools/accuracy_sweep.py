@@ -154,8 +154,9 @@ def lages_miguel(size: tuple[int, int], rounds: int, threads: int) -> list[str]:
 
 def errors(row: sweep.Row) -> str:
     """Cells of a row's errors."""
-    flip = "" if row.flip is None else f"{row.flip:.4f}"
-    return f"{row.off_share:.3%} | {row.error_median_px:.3g} | {row.error_p95_px:.3g} | {flip}"
+    cells = ((row.error_median_px, ".3g"), (row.error_p95_px, ".3g"), (row.flip, ".4f"))
+    shown = ["" if value is None else format(value, style) for value, style in cells]
+    return " | ".join([f"{row.off_share:.3%}", *shown])
 
 
 def heading(result: sweep.Sweep, title: str) -> list[str]:

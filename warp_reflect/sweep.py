@@ -114,15 +114,15 @@ class Row:
     off_share: float = 0.0
     """Not within half a pixel of the truth: shifted by more, wrong, unmatched or unanswered."""
     wrong_share: float = 0.0
-    error_mean_px: float = 0.0
-    """Pixel errors are of all pixels that show the right prim, identical ones counted as 0."""
-    error_median_px: float = 0.0
-    error_p95_px: float = 0.0
-    error_max_px: float = 0.0
-    angle_median_deg: float = 0.0
-    """Between the directions from the mirror to what is shown and to what should be."""
-    angle_p95_deg: float = 0.0
-    angle_max_deg: float = 0.0
+    error_mean_px: float | None = None
+    """Pixel errors are of all pixels that show the right prim, identical ones counted as 0; None: no pixel does."""
+    error_median_px: float | None = None
+    error_p95_px: float | None = None
+    error_max_px: float | None = None
+    angle_median_deg: float | None = None
+    """Between the directions from the mirror to what is shown and to what should be; None: nothing is shown."""
+    angle_p95_deg: float | None = None
+    angle_max_deg: float | None = None
     psnr_db: float | None = None
     """Of the sRGB picture; None: equal."""
     flip: float | None = None

@@ -138,9 +138,13 @@ def off_share(row: Row) -> float:
     return row.off_share
 
 
-def frontier(sweep: Sweep, error: Callable[[Row], float]) -> list[Row]:
+def frontier(sweep: Sweep, error: Callable[[Row], float | None]) -> list[Row]:
     """Of the rows without the reference, those that no faster one equals."""
-    return pareto([row for row in sweep.rows if row.name != REFERENCE], lambda row: row.reflect_ms, error)
+    return pareto(
+        [row for row in sweep.rows if row.name != REFERENCE and error(row) is not None],
+        lambda row: row.reflect_ms,
+        error,
+    )
 
 
 def pareto_png(sweep: Sweep) -> bytes:
@@ -166,8 +170,8 @@ def pareto_png(sweep: Sweep) -> bytes:
     return _png(figure)
 
 
-def _draw_panel(axes, sweep: Sweep, error: Callable[[Row], float], title: str, least: float) -> None:
-    rows = [row for row in sweep.rows if row.name != REFERENCE]
+def _draw_panel(axes, sweep: Sweep, error: Callable[[Row], float | None], title: str, least: float) -> None:
+    rows = [row for row in sweep.rows if row.name != REFERENCE and error(row) is not None]
     positive = [error(row) for row in rows if error(row) > 0.0]
     # What has no error stands on a line of its own below all others.
     least = min([least, *(0.5 * each for each in positive)])
