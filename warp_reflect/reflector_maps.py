@@ -176,10 +176,10 @@ class ReflectorMap:
             device: Warp device of the view.
 
         Raises:
-            ValueError: The mesh is neither a closed convex body nor an open part of one's surface: no single map holds it.
+            ValueError: The mesh is neither a closed convex body nor an open part of one's surface: no single map holds it;
+                or an array has another shape, points that are not finite or out of range, or no area at all.
         """
-        points = np.asarray(points, np.float64)
-        faces = np.asarray(faces, np.int32)
+        points, faces = _checked_mesh(points, faces)
         body = body or analyse(points, faces)
         if not body.convex:
             sheet = None if body.closed else fit_sheet(points[faces], inner=False)
@@ -294,6 +294,21 @@ CLOSED_ACCEPTED = 1.0e-3  # residual (tangent): every vertex of a smooth closed 
 OPEN_ACCEPTED = 0.3  # sheets of general meshes have creases sharper than a texel
 RIM_PLANES = 160  # at most so many tangent planes close an open reflector
 BLEND_POWER = 8.0
+
+
+def _checked_mesh(points, faces) -> tuple[np.ndarray, np.ndarray]:
+    """A mesh as float64 [n, 3] and int32 [m, 3] that can be analysed."""
+    points, faces = np.asarray(points, np.float64), np.asarray(faces)
+    if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
+        raise ValueError(f"points: got shape {points.shape}, expected [n, 3] of finite numbers")
+    if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
+        raise ValueError(f"faces: got {faces.dtype} of shape {faces.shape}, expected integers of shape [m, 3]")
+    if faces.size and (faces.min() < 0 or faces.max() >= len(points)):
+        raise ValueError(f"faces: got {faces.min()} to {faces.max()}, expected 0 to {len(points) - 1}")
+    corner = points[faces] - points[faces[:, :1]]
+    if not faces.size or not np.any(np.cross(corner[:, 1], corner[:, 2])):
+        raise ValueError(f"faces: {len(faces)} triangles without any area, expected the surface of a body")
+    return points, faces.astype(np.int32)
 
 
 def _rim(points: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -133,7 +133,10 @@ MATRIX: dict[str, tuple[str, tuple[str, ...]]] = {
         (SOLVE + "eye_in_a_tilted_plane_is_hidden", FORWARD + "plane_seen_edge_on_or_from_its_plane_is_finite"),
     ),
     "P05": ("eye behind the plane", (SOLVE + "plane_status",)),
-    "P06": ("plane at 1e7", (HERE + "far_plane_mirrors_as_near",)),
+    "P06": (
+        "plane at 1e7",
+        (HERE + "far_plane_mirrors_as_near", HERE + "far_points_reflect_in_a_plane_where_they_should"),
+    ),
     "P07": ("mirrored twice", (SOLVE + "plane_mirrors_twice_to_itself",)),
     "P08": ("mirrored transform", (HERE + "mirrored_transform_shows_the_baked_mesh",)),
     "P09": ("what stands behind the mirror's plane", (FORWARD + "planar_equals_the_picture_of_a_mirrored_eye",)),

@@ -236,18 +236,28 @@ def test_flat_bodies_and_sharp_edges_have_finite_answers(axes):
         assert (solution.residual[solution.status == Status.CONVERGED] < 2e-2).all()
 
 
+SQUARE = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)]
+
+
 @pytest.mark.parametrize(
-    ("points", "faces"),
+    ("points", "faces", "text"),
     [
-        ([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)], [(0, 1, 2), (0, 2, 3), (2, 1, 0), (3, 2, 0)]),
-        ([(0, 0, 0), (1, 0, 0), (2, 0, 0)], [(0, 1, 2), (2, 1, 0)]),
-        ([(5, 5, 5)] * 3, [(0, 1, 2), (2, 1, 0)]),
+        (SQUARE, [(0, 1, 2), (0, 2, 3), (2, 1, 0), (3, 2, 0)], "open"),
+        ([(0, 0, 0), (1, 0, 0), (2, 0, 0)], [(0, 1, 2), (2, 1, 0)], "without any area"),
+        ([(5, 5, 5)] * 3, [(0, 1, 2), (2, 1, 0)], "without any area"),
+        (SQUARE, np.zeros((0, 3), np.int32), "0 triangles"),
+        (SQUARE, [(0, 1, 4)], "got 0 to 4, expected 0 to 3"),
+        (SQUARE, [(0, 1, -1)], "got -1 to 1"),
+        (SQUARE, [(0.0, 1.0, np.nan)], "got float64"),
+        ([(0, 0, np.nan), (1, 0, 0), (1, 1, 0)], [(0, 1, 2)], "finite"),
+        ([(0, 0), (1, 0), (1, 1)], [(0, 1, 2)], "got shape (3, 2)"),
     ],
 )
-def test_bodies_without_an_inside_are_refused(points, faces):
-    """Two-sided sheets, lines and points: there is no centre off the surface."""
-    with pytest.raises(ValueError):
-        wr.ReflectorMap.from_mesh(np.array(points, float), np.array(faces, np.int32), resolution=16)
+def test_bodies_without_an_inside_are_refused(points, faces, text):
+    """Two-sided sheets, lines, points and damaged arrays: there is no centre off the surface."""
+    with pytest.raises(ValueError) as caught:
+        wr.ReflectorMap.from_mesh(np.array(points, float), np.array(faces), resolution=16)
+    assert text in str(caught.value) and "\n" not in str(caught.value)
 
 
 # --- the octree of the grid (GI01-GI03, GI06-GI08)
@@ -358,6 +368,28 @@ def test_far_plane_mirrors_as_near():
     np.testing.assert_array_equal(far.status, near.status)
     assert (near.status == Status.CONVERGED).mean() > 0.9
     assert np.abs(far.virtual - centre - near.virtual).max() <= 16 * np.spacing(1e7)
+
+
+@pytest.mark.parametrize("distance", [1e2, 1e4, 1e6, 1e8])
+def test_far_points_reflect_in_a_plane_where_they_should(distance):
+    """K(8): R divides the line to the mirrored point by the heights, and a height share near 1 keeps its complement."""
+    rng = np.random.default_rng(9)
+    eye = np.array([-0.75, 1.0, 3.5])
+    points = rng.normal(size=(50, 3))
+    points[:, 2] = np.abs(points[:, 2]) + 0.1
+    points *= distance / np.linalg.norm(points, axis=1, keepdims=True)
+    for dtype in (np.float32, np.float64):
+        given = points.astype(dtype)
+        solution = wr.solve(wr.PlanarMirror((0, 0, 0), (0, 0, 1)), eye, given)
+        assert (solution.status == Status.CONVERGED).all()
+        for found, point in zip(solution.point, given.astype(np.float64), strict=True):
+            with mpmath.workdps(40):
+                h_eye, h_point = mpmath.mpf(eye[2]), mpmath.mpf(float(point[2]))
+                exact = [
+                    float((h_point * mpmath.mpf(eye[k]) + h_eye * mpmath.mpf(float(point[k]))) / (h_eye + h_point))
+                    for k in (0, 1)
+                ]
+            assert np.abs(found[:2] - exact).max() <= 8 * roundoff(dtype) * max(1.0, np.abs(exact).max())
 
 
 @pytest.mark.parametrize("method", ["reference", "reflector_map"])
