@@ -146,6 +146,24 @@ def _window_pixels(window) -> np.ndarray:
     return vtk_to_numpy(data).reshape(height, width, 4)[::-1, :, :3]
 
 
+def test_window_answers_between_the_steps_of_a_rest(window):
+    """A window on a screen shows the refined frame first; its timer brings the error and the 3-D pane."""
+    window.stepwise = True
+    start, meshes = window.frame_place(20, 40), window.meshes
+    drag(window, start, (start[0] + 30, start[1]))
+    assert not window.session.coarse and window.session.comparison is None and window.meshes is meshes
+    send(window, "TimerEvent", *start)
+    assert window.session.comparison is not None and window.meshes is meshes
+    drag(
+        window, start, (start[0] - 30, start[1])
+    )  # the hand moves on: the 3-D pane is not brought up to date for nothing
+    assert window.session.comparison is None
+    for _ in range(3):
+        send(window, "TimerEvent", *start)
+    assert window.session.comparison is not None and window.meshes is not meshes
+    assert not window._pending
+
+
 def test_shift_drag_pans_and_wheel_zooms(window):
     session, pivot = window.session, window.session.pivot.copy()
     away = np.linalg.norm(session.camera.eye - pivot)

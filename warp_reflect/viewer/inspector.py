@@ -27,6 +27,7 @@ FRAME, SPACE, CONTROLS, REFERENCE, ERROR, TEXT = range(COLUMNS * ROWS)  # panes,
 FLAT = (FRAME, CONTROLS, REFERENCE, ERROR, TEXT)
 BACKEND = "VTK_DEFAULT_OPENGL_WINDOW"  # VTK's environment variable
 STILL_SECONDS = 0.25  # without a move after which a coarse frame is refined
+STEP_MS = 1  # until the next step of what follows a refined frame: as soon as the window has answered
 TOLD_SECONDS = 0.2  # between two drawings of the numbers while the camera moves; text costs as much as a coarse frame
 POINTS_SHOWN = 1500  # reflection points: more would cover the mirrors
 CLICK_SLACK = 3  # pixels that a hand moves in a click
@@ -81,6 +82,7 @@ class Inspector:
         wipe: Share of the frame's width from where the reference is shown; 1: none of it.
         whole_plan, shows_regions, shows_virtual: What the keys p, g and v switch.
         meshes: What the 3-D pane shows, see `geometry.meshes`.
+        stepwise: Leave measuring and the 3-D pane to the timer, so that a window answers between them.
     """
 
     def __init__(self, session: Session, off_screen: bool | None = None, window_size: tuple[int, int] = WINDOW):
@@ -89,6 +91,7 @@ class Inspector:
         self.whole_plan = self.shows_regions = False
         self.shows_virtual = True
         self.meshes: dict[str, pv.PolyData] = {}
+        self._pending: list = []
         self._drag: str | None = None
         self._at = self._start = (0, 0)
         self._typed: str | None = None
@@ -107,6 +110,7 @@ class Inspector:
         space = self.plotter.renderers[SPACE]
         space.set_background(SPACE_BACK)
         self._place_space_camera()
+        self.stepwise = not self.plotter.off_screen
         self._observe()
         self.settle()
 
@@ -114,17 +118,36 @@ class Inspector:
 
     def settle(self) -> None:
         """Refine what moved, measure its error, bring the 3-D pane up to date, and draw."""
-        session = self.session
-        session.refine()
-        self._picture = picture(session.frame)
+        self._pending = [self._refine, self._measure, self._show_space]
+        while self._pending:
+            self._pending.pop(0)()
+
+    def _rest(self) -> None:
+        """As `settle`; in steps, where a hand may move again between them."""
+        self.settle() if not self.stepwise else self._begin()
+
+    def _begin(self) -> None:
+        self._pending = [self._measure, self._show_space]
+        self._refine()
+        self.plotter.iren.interactor.CreateOneShotTimer(STEP_MS)
+
+    def _refine(self) -> None:
+        self.session.refine()
+        self._picture = picture(self.session.frame)
         self._reference = self._heat = None
         if self.meshes:  # the window is up: what is ready is shown, the slower things follow
-            self.draw(FRAME, CONTROLS, TEXT)
+            self.draw(*FLAT)
+
+    def _measure(self) -> None:
+        session = self.session
         session.measure()
         self._reference = picture(session.reference)
         self._heat = heat_map(session.comparison)
         if self.meshes:
             self.draw(*FLAT)
+
+    def _show_space(self) -> None:
+        session = self.session
         self.meshes = geometry.meshes(session.plan, session.frame, session.picks, apart=False)
         self._fill_space()
         self.draw()
@@ -174,7 +197,9 @@ class Inspector:
             return panes.error_pane(size, None if session.coarse else self._heat, session.size, waiting)
         right = None if session.coarse else self._reference
         mark = session.picks[-1].pixel if session.picks else None
-        title = "frame" + (" (moving)" if session.coarse else " | reference, right of the line")
+        title = (
+            "frame (moving)" if session.coarse else "frame" if right is None else "frame | reference, right of the line"
+        )
         return panes.picture_pane(size, title, self._picture, session.size, right, self.wipe, mark)
 
     # The 3-D pane.
@@ -369,7 +394,7 @@ class Inspector:
         if drag == "orbit" and self._at == self._start and event.startswith("Left"):
             self._pick_at(*self._start)
         if self.session.coarse:
-            self.settle()
+            self._rest()
         return True
 
     def _wheel(self, event: str) -> bool:
@@ -382,6 +407,7 @@ class Inspector:
 
     def _show_moving(self) -> None:
         self._picture = picture(self.session.frame)
+        self._pending = []
         self._moved_at = perf_counter()
         # Once per motion the other panes say that they wait; then only the frame and its numbers are drawn.
         changed = [FRAME] if self._reference is None else [FRAME, REFERENCE, ERROR]
@@ -395,8 +421,13 @@ class Inspector:
 
     def _timer(self, _event: str) -> bool:
         rested = perf_counter() - self._moved_at >= 0.9 * STILL_SECONDS
-        if self.session.coarse and rested and self._drag is None:
-            self.settle()
+        if self.session.coarse:
+            if rested and self._drag is None:
+                self._rest()
+        elif self._pending:
+            self._pending.pop(0)()
+            if self._pending:
+                self.plotter.iren.interactor.CreateOneShotTimer(STEP_MS)
         return False
 
     def _pick_at(self, x: int, y: int) -> None:
@@ -422,7 +453,7 @@ class Inspector:
     def turn_knob(self, name: str, value) -> None:
         """Set a control, the camera or the time; what is refused stays, with the reason on screen."""
         if self.session.turn_knob(name, value):
-            self.settle()
+            self._rest()
         else:
             self.draw(CONTROLS)
 
