@@ -25,6 +25,7 @@ from warp_reflect.viewer import cameras
 COARSE = 4  # a side of a moving picture is this much shorter
 COARSE_MIN = 16  # pixels a side: below it nothing is recognised
 ORBIT_PER_SIDE = math.pi  # radians of an orbit for a drag across the whole picture
+DIGITS = 5  # of a picked point, counted from the size of the path length
 TIMES_MAX = 400  # positions of the time slider, about one a pixel
 ERROR_SHOWN_PX = 2.0  # pixel error at the hot end of the heat map
 
@@ -114,9 +115,12 @@ class Pick:
 
     def lines(self) -> list[str]:
         """The pixel in words."""
+        # Digits as the view's size asks: a stage may lie far from the origin.
+        scale = self.path_length or 1.0
+        decimals = min(max(DIGITS - 1 - math.floor(math.log10(scale)), 0), 12)
 
         def point(p: np.ndarray) -> str:
-            return "({:.5g}, {:.5g}, {:.5g})".format(*p)
+            return "(" + ", ".join(f"{x:.{decimals}f}" for x in p) + ")"
 
         lines = [f"pixel ({self.pixel[0]}, {self.pixel[1]}): {self.prim or 'background'}"]
         if not self.reflector:
