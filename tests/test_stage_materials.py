@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import stage_samples as samples
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade
+from pxr import Gf, Sdf, UsdGeom, UsdLux, UsdShade
 
 from warp_reflect.images import write_exr, write_png
 from warp_reflect.stage.lights import latlong
