@@ -284,6 +284,8 @@ def write_answer(
     out_virtual: wp.array(dtype=Any),
     out_residual: wp.array(dtype=Any),
 ):
+    if found.status == DEGENERATE:
+        return  # no direction: what is there stays 0
     p = view.origin + size * (view.axes * found.point)
     v = view.origin + size * (view.axes * found.image)
     n = view.axes * found.normal
@@ -307,6 +309,9 @@ def write_root(
     out_root_index: wp.array2d(dtype=wp.uint8),
     out_root_status: wp.array2d(dtype=wp.uint8),
 ):
+    if found.status == DEGENERATE:
+        out_root_status[row, slot] = wp.uint8(found.status)
+        return
     p = view.origin + size * (view.axes * found.point)
     out_roots[row, slot] = type(zero)(zero.dtype(p[0]), zero.dtype(p[1]), zero.dtype(p[2]))
     out_root_length[row, slot] = zero.dtype(size * found.length)
