@@ -1,6 +1,6 @@
 """The package beside other renderers on the same stage, pixels and threads: its pictures judged, its time compared.
 
-    python tools/peers.py usd_scenes/kitchen.usda --compare --out /tmp/pairs
+    python tools/peers.py usd_scenes/kitchen.usda --compare --out pairs
     python tools/peers.py usd_scenes/kitchen.usda usd_scenes/one_mirror.usda --rounds 5
 
 `--compare` judges the picture: the stage, with what is neither diffuse nor a sharp mirror taken off its materials, by
