@@ -19,7 +19,7 @@ Opacity is not looked at. The background is the dome; alpha is coverage.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import warp as wp
@@ -391,18 +391,29 @@ def shade_kernel(
 
 
 @wp.kernel
-def mirror_term_kernel(
+def seen_radiance_kernel(
     first: int,
     scene: SceneView,
     lights: LightView,
     looks: wp.array(dtype=Look),
     normals: wp.array(dtype=wp.vec3),
     direct: wp.array(dtype=wp.vec3),
-    pixel: wp.array(dtype=int),
     direction: wp.array(dtype=wp.vec3),
     triangle: wp.array(dtype=int),
     u: wp.array(dtype=float),
     v: wp.array(dtype=float),
+    out_radiance: wp.array(dtype=wp.vec3),
+):
+    """One thread per mirror pixel."""
+    i = first + wp.tid()
+    out_radiance[i] = hit_radiance(scene, lights, looks, normals, direct, i, triangle[i], u[i], v[i], direction[i])
+
+
+@wp.kernel
+def mirror_term_kernel(
+    first: int,
+    pixel: wp.array(dtype=int),
+    radiance: wp.array(dtype=wp.vec3),
     # Outputs:
     out_picture: wp.array(dtype=wp.vec4),
     out_mirror: wp.array(dtype=wp.vec3),
@@ -410,14 +421,38 @@ def mirror_term_kernel(
     """One thread per mirror pixel; finds the mirror's weight in `out_mirror`."""
     i = first + wp.tid()
     p = pixel[i]
-    seen = hit_radiance(scene, lights, looks, normals, direct, i, triangle[i], u[i], v[i], direction[i])
-    term = wp.cw_mul(out_mirror[p], seen)
+    term = wp.cw_mul(out_mirror[p], radiance[i])
     out_mirror[p] = term
     out_picture[p] += wp.vec4(term[0], term[1], term[2], 0.0)
 
 
+def seen_radiance(
+    scene: Scene, gbuffer: GBuffer, layer: ReflectionLayer, threads: int = 0, shadows: bool = False
+) -> wp.array:
+    """What a mirror's pixels see, before the mirror's own weight.
+
+    Returns:
+        Linear RGB radiance, vec3 [layer.pixels.count]: the layer's own where it has one (maps), else that of its hits.
+    """
+    if layer.radiance is not None:
+        return layer.radiance
+    pixels = layer.pixels
+    looks = prepare_looks(scene, gbuffer, layer, threads)
+    normals = prepare_normals(scene, gbuffer, layer, threads)
+    direct = direct_irradiance(scene, scene.lights.direct, gbuffer, layer, shadows, threads, normals)
+    radiance = wp.empty(pixels.count, dtype=wp.vec3, device=scene.device)
+    inputs = [scene.view, scene.lights, looks, normals, direct, pixels.direction, layer.triangle, layer.u, layer.v]
+    launch.launch(seen_radiance_kernel, pixels.count, [*inputs, radiance], scene.device, threads)
+    return radiance
+
+
 def shade(
-    scene: Scene, gbuffer: GBuffer, layers: Mapping[int, ReflectionLayer], threads: int = 0, shadows: bool = False
+    scene: Scene,
+    gbuffer: GBuffer,
+    layers: Mapping[int, ReflectionLayer],
+    threads: int = 0,
+    shadows: bool = False,
+    finish: Callable[[ReflectionLayer, wp.array], wp.array] | None = None,
 ) -> tuple[wp.array, wp.array]:
     """The picture of a frame.
 
@@ -427,6 +462,7 @@ def shade(
         layers: The answer of every reflector that `reflector_id` names.
         threads: CPU threads; 0: one per core.
         shadows: Distant lights cast shadows, directly seen and in mirrors.
+        finish: Turns what a sharp mirror's pixels see (vec3 [pixels]) into what this mirror's do; None: all are sharp.
 
     Returns:
         (linear RGB radiance and coverage, vec4 [height * width]; the reflectors' mirror term alone, vec3
@@ -444,11 +480,10 @@ def shade(
     inputs += [picture, mirror]
     launch.launch(shade_kernel, count, inputs, device, threads)
     for layer in layers.values():
-        pixels = layer.pixels
-        looks = prepare_looks(scene, gbuffer, layer, threads)
-        normals = prepare_normals(scene, gbuffer, layer, threads)
-        direct = direct_irradiance(scene, lights.direct, gbuffer, layer, shadows, threads, normals)
-        inputs = [scene.view, lights, looks, normals, direct, pixels.pixel, pixels.direction]
-        inputs += [layer.triangle, layer.u, layer.v, picture, mirror]
-        launch.launch(mirror_term_kernel, pixels.count, inputs, device, threads)
+        radiance = seen_radiance(scene, gbuffer, layer, threads, shadows)
+        if finish is not None:
+            radiance = finish(layer, radiance)
+        launch.launch(
+            mirror_term_kernel, layer.pixels.count, [layer.pixels.pixel, radiance, picture, mirror], device, threads
+        )
     return picture, mirror
