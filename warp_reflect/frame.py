@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import os
 from functools import cached_property
 
@@ -11,6 +12,7 @@ import warp as wp
 
 from warp_reflect import __version__, images, motion, raster, shade, surface
 from warp_reflect.channels import CHANNELS, POINTS, component_of, known_names, reflection_channels
+from warp_reflect.effects import FINISHES
 from warp_reflect.layers import Camera, GBuffer, ReflectionLayer, add_statistics
 from warp_reflect.planner import Plan, PlanRow, find_camera
 from warp_reflect.scene import Scene
@@ -216,7 +218,7 @@ def render_frame(scene: Scene, plan: Plan, camera: str | Camera | None = None, p
     view = plan.camera if camera is None else find_camera(scene, camera, plan.size)
     gbuffer, layers = reflect_scene(scene, plan, view, timer, previous)
     with timer("shade"):
-        picture = shade.shade(scene, gbuffer, layers, settings.threads, settings.shadows)
+        picture = shade.shade(scene, gbuffer, layers, settings.threads, settings.shadows, _finish(scene, plan))
     timings = timer.ms
     for layer in layers.values():
         for step, ms in layer.timings.items():
@@ -258,6 +260,23 @@ def reflect_scene(
                 _history(previous, scene, row),
             )
     return gbuffer, layers
+
+
+def _finish(scene: Scene, plan: Plan) -> shade.Finish | None:
+    """What the planned finishes make of what sharp mirrors see; None where every mirror is sharp and plain."""
+    planned = {row.reflector.id: [name for name in FINISHES if row.effects[name].on] for row in plan.rows}
+    if not any(planned.values()):
+        return None
+    rows = {row.reflector.id: row for row in plan.rows}
+
+    def finish(shown: shade.Shown, layer: ReflectionLayer, sharp: wp.array) -> wp.array:
+        radiance, reflector = sharp, layer.pixels.reflector
+        for name in planned[reflector]:
+            module = importlib.import_module(f"warp_reflect.finishes.{FINISHES[name]}")
+            radiance = module.apply(scene, shown, layer, sharp, radiance, rows[reflector])
+        return radiance
+
+    return finish
 
 
 def _history(previous: Frame | None, scene: Scene, row: PlanRow):

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from warp_reflect import __version__, budget, raster
+from warp_reflect.effects import Effect, finish_effects
 from warp_reflect.layers import Camera, Reflector
 from warp_reflect.scene import Note, PartRange, Scene, reflectance
 from warp_reflect.settings import Settings
@@ -21,15 +22,6 @@ METHODS = ("auto", "reference")
 REUSING = ("quadric", "reflector_map")  # know a bound on how far a virtual vertex drifts
 REC709_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 DEFAULT_SIZE = (960, 540)  # usdrecord's default width at 16:9
-
-
-@dataclass(frozen=True)
-class Effect:
-    """One effect of a reflector: on or off, the reason, and the numbers it was decided by."""
-
-    on: bool
-    reason: str
-    numbers: dict = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -389,4 +381,5 @@ def _effects(scene, part, technique, pixels, weight, settings) -> dict[str, Effe
         ),
         "shadows": Effect(settings.shadows, f"shadows={settings.shadows}"),
         "second_bounce": Effect(False, "a mirror seen in a mirror shows its base and the dome, one level deep"),
+        **finish_effects(scene, part, visible, settings),
     }

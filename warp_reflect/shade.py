@@ -20,6 +20,7 @@ Opacity is not looked at. The background is the dome; alpha is coverage.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
@@ -44,6 +45,24 @@ SHARP_ROUGHNESS = wp.constant(0.05)
 ROUGH_ROUGHNESS = wp.constant(0.3)
 PI = wp.constant(float(np.pi))
 LIGHT_KINDS = ("dome", "distant", *AREA_KINDS)
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What the eye sees directly, with what textures say of it.
+
+    Attributes:
+        looks: `Look` [height * width], see `textures.prepare_looks`.
+        normals: vec3 [height * width], see `normal_maps.prepare_normals`.
+    """
+
+    gbuffer: GBuffer
+    looks: wp.array
+    normals: wp.array
+
+
+# Of what is shown, a mirror's layer and what its pixels see in a sharp mirror: what they see in this one.
+Finish = Callable[[Shown, ReflectionLayer, wp.array], wp.array]
 
 
 @wp.struct
@@ -452,7 +471,7 @@ def shade(
     layers: Mapping[int, ReflectionLayer],
     threads: int = 0,
     shadows: bool = False,
-    finish: Callable[[ReflectionLayer, wp.array], wp.array] | None = None,
+    finish: Finish | None = None,
 ) -> tuple[wp.array, wp.array]:
     """The picture of a frame.
 
@@ -462,7 +481,8 @@ def shade(
         layers: The answer of every reflector that `reflector_id` names.
         threads: CPU threads; 0: one per core.
         shadows: Distant lights cast shadows, directly seen and in mirrors.
-        finish: Turns what a sharp mirror's pixels see (vec3 [pixels]) into what this mirror's do; None: all are sharp.
+        finish: Turns what a sharp mirror's pixels see (vec3 [layer.pixels.count]) into what this mirror's do; None: all
+            are sharp.
 
     Returns:
         (linear RGB radiance and coverage, vec4 [height * width]; the reflectors' mirror term alone, vec3
@@ -482,7 +502,7 @@ def shade(
     for layer in layers.values():
         radiance = seen_radiance(scene, gbuffer, layer, threads, shadows)
         if finish is not None:
-            radiance = finish(layer, radiance)
+            radiance = finish(Shown(gbuffer, looks, normals), layer, radiance)
         launch.launch(
             mirror_term_kernel, layer.pixels.count, [layer.pixels.pixel, radiance, picture, mirror], device, threads
         )

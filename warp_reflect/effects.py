@@ -1,0 +1,33 @@
+"""Which effects a reflector calls for beyond its sharp picture, each with one reason: a value, its threshold, its setting."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from warp_reflect.scene import PartRange, Scene
+from warp_reflect.settings import Settings
+
+# The effects that are finishes, in the order in which they are applied, and the module of `finishes` of each.
+FINISHES: dict[str, str] = {}
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One effect of a reflector: on or off, the reason, and the numbers it was decided by."""
+
+    on: bool
+    reason: str
+    numbers: dict = field(default_factory=dict)
+
+
+def finish_effects(scene: Scene, part: PartRange, visible: bool, settings: Settings) -> dict[str, Effect]:
+    """The finishes of a reflector, one effect for each name of `FINISHES`.
+
+    Args:
+        scene, part: The reflector's.
+        visible: Whether the plan's camera sees it; what is not seen has no finish.
+        settings: The reflector's.
+    """
+    if not visible:
+        return {name: Effect(False, "not seen from the camera") for name in FINISHES}
+    return {}
