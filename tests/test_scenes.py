@@ -57,7 +57,7 @@ def loaded(name: str, device: str) -> wr.Scene:
 @functools.cache
 def rendered(name: str, device: str, method: str, threads: int = 0, size: tuple[int, int] = SIZE) -> wr.Frame:
     scene = loaded(name, device)
-    plan = wr.make_plan(scene, size=size, settings=wr.Settings(threads=threads), method=method)
+    plan = wr.make_plan(scene, size=size, settings=wr.Settings(threads=threads, keep_static=False), method=method)
     return wr.render_frame(scene, plan)
 
 

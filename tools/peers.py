@@ -195,7 +195,7 @@ def times(stage: str, size: tuple[int, int], arguments, llvm: bool) -> list[dict
     from warp_reflect.images import write_png
 
     scene, mirrors = diffuse_stage(stage, size) if llvm else (wr.load_stage(stage), set())
-    base = wr.Settings(threads=arguments.threads)
+    base = wr.Settings(threads=arguments.threads, keep_static=False)
     first = wr.render_frame(scene, wr.make_plan(scene, size=size, settings=base, method="reference"))
     contenders = package_contenders(scene, size, base, first)
     judged = None

@@ -13,7 +13,7 @@ import warp as wp
 from warp_reflect import __version__, images, motion, raster, shade, surface
 from warp_reflect.channels import CHANNELS, POINTS, component_of, known_names, reflection_channels
 from warp_reflect.effects import FINISHES
-from warp_reflect.layers import Camera, GBuffer, ReflectionLayer, add_statistics
+from warp_reflect.layers import Camera, GBuffer, MirrorPixels, ReflectionLayer, add_statistics
 from warp_reflect.planner import Plan, PlanRow, find_camera
 from warp_reflect.scene import Scene
 from warp_reflect.settings import Technique
@@ -34,6 +34,7 @@ class Frame:
         statistics: Counts over all reflectors: pixels settled by `candidate`, `walk`, `empty`, `bvh`; vertices; ...; the
             largest bounds: `reused_px`.
         timings: Milliseconds per stage.
+        kept: Ids of the reflectors whose layer is the previous frame's own, as nothing had moved.
     """
 
     def __init__(
@@ -52,6 +53,7 @@ class Frame:
         self.camera: Camera = gbuffer.camera
         self.timings = timings
         self._picture = picture
+        self.kept = _kept(layers, previous)
         self.statistics: dict = {}
         for layer in layers.values():
             add_statistics(self.statistics, layer.statistics)
@@ -207,7 +209,8 @@ def render_frame(scene: Scene, plan: Plan, camera: str | Camera | None = None, p
         scene: The plan's scene, or the same stage at another time, which is planned anew (`Frame.plan`).
         plan: From `make_plan`; keeps what its techniques prepare.
         camera: Another camera than the plan's; None: the plan's.
-        previous: The last frame; searches start from its reflection points, and motion is measured from it.
+        previous: The last frame; searches start from its reflection points, and motion is measured from it. Where neither
+            the eye nor the world has moved since, its answers are taken over (setting `keep_static`).
 
     Returns:
         A `Frame`.
@@ -217,11 +220,15 @@ def render_frame(scene: Scene, plan: Plan, camera: str | Camera | None = None, p
     settings = plan.settings
     view = plan.camera if camera is None else find_camera(scene, camera, plan.size)
     gbuffer, layers = reflect_scene(scene, plan, view, timer, previous)
-    with timer("shade"):
-        picture = shade.shade(scene, gbuffer, layers, settings.threads, settings.shadows, _finish(scene, plan))
+    kept = _kept(layers, previous)
+    if previous and gbuffer is previous.gbuffer and len(kept) == len(layers) and previous.plan.settings == settings:
+        picture = previous._picture
+    else:
+        with timer("shade"):
+            picture = shade.shade(scene, gbuffer, layers, settings.threads, settings.shadows, _finish(scene, plan))
     timings = timer.ms
-    for layer in layers.values():
-        for step, ms in layer.timings.items():
+    for id in layers.keys() - kept:
+        for step, ms in layers[id].timings.items():
             timings["reflect/" + step] = timings.get("reflect/" + step, 0.0) + ms
     return Frame(scene, plan, gbuffer, layers, picture, timings, previous)
 
@@ -237,15 +244,18 @@ def reflect_scene(
         timer: Gets the steps.
         previous: See `render_frame`.
     """
-    settings = plan.settings
-    with timer("raster"):
-        gbuffer = raster.draw_scene(scene, view, settings.threads)
-    with timer("mirror_pixels"):
-        parts = {row.reflector.id: row.reflector.part for row in plan.rows}
-        pixels, gbuffer.reflector_id = surface.mirror_pixels(scene, gbuffer, parts, settings.threads)
+    if _is_still(previous, scene, plan, view):
+        gbuffer, answered = previous.gbuffer, _answered(previous, plan)
+        pixels = {id: layer.pixels for id, layer in previous.layers.items()}
+    else:
+        gbuffer, pixels = _look(scene, plan, view, timer)
+        answered = {}
     layers = {}
     for row in plan.rows:
-        if pixels[row.reflector.id].count == 0:
+        if row.reflector.id not in pixels or pixels[row.reflector.id].count == 0:
+            continue
+        if row.reflector.id in answered:
+            layers[row.reflector.id] = answered[row.reflector.id]
             continue
         with timer("prepare"):
             prepared = plan.prepared(row)
@@ -277,6 +287,47 @@ def _finish(scene: Scene, plan: Plan) -> shade.Finish | None:
         return radiance
 
     return finish
+
+
+def _look(scene: Scene, plan: Plan, view: Camera, timer: StageTimer) -> tuple[GBuffer, dict[int, MirrorPixels]]:
+    """What the eye sees, and the pixels of every mirror."""
+    threads = plan.settings.threads
+    with timer("raster"):
+        gbuffer = raster.draw_scene(scene, view, threads)
+    with timer("mirror_pixels"):
+        pixels, gbuffer.reflector_id = surface.mirror_pixels(scene, gbuffer, _mirrors(plan), threads)
+    return gbuffer, pixels
+
+
+def _mirrors(plan: Plan) -> dict[int, int]:
+    """Reflector id to part of the scene."""
+    return {row.reflector.id: row.reflector.part for row in plan.rows}
+
+
+def _is_still(previous: Frame | None, scene: Scene, plan: Plan, view: Camera) -> bool:
+    """Whether the previous frame saw the same world from the same eye, with the same mirrors in it."""
+    return (
+        previous is not None
+        and plan.settings.keep_static
+        and previous.scene.shares_world(scene)
+        and previous.camera.sees_as(view)
+        and _mirrors(previous.plan) == _mirrors(plan)
+    )
+
+
+def _answered(previous: Frame, plan: Plan) -> dict[int, ReflectionLayer]:
+    """The layers of a still frame whose rows ask the same again."""
+    asked, before = ({row.reflector.id: _request(row) for row in each.rows} for each in (plan, previous.plan))
+    return {id: layer for id, layer in previous.layers.items() if asked[id] == before[id]}
+
+
+def _request(row: PlanRow) -> tuple:
+    return row.technique, row.settings, {name: effect.on for name, effect in row.effects.items()}
+
+
+def _kept(layers: dict[int, ReflectionLayer], previous: Frame | None) -> frozenset[int]:
+    """Ids of the layers that are the previous frame's own."""
+    return frozenset(id for id, layer in layers.items() if previous and previous.layers.get(id) is layer)
 
 
 def _history(previous: Frame | None, scene: Scene, row: PlanRow):

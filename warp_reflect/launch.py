@@ -10,7 +10,9 @@ bit-equal at any number of threads.
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import cache, partial
 
 import warp as wp
@@ -21,6 +23,26 @@ SPLIT_MIN = 4096  # elements below which the hand-off (20-60 us) costs more than
 CORES_VARIABLE = "WARP_REFLECT_THREADS"
 CPU_BLOCK_DIM = 1  # what Warp launches with on the CPU
 SLICE_ALIGN = 64  # elements; slices that share a cache line of 4-byte results would ping-pong it
+
+
+_recordings: list[list[tuple[str, int]]] = []
+
+
+@contextmanager
+def recorded() -> Iterator[list[tuple[str, int]]]:
+    """Gives a list that gets (module.kernel, elements) of every launch made in the context, on all threads."""
+    launches: list[tuple[str, int]] = []
+    _recordings.append(launches)
+    try:
+        yield launches
+    finally:
+        # By identity: two recordings may hold equal lists.
+        _recordings[:] = [each for each in _recordings if each is not launches]
+
+
+def _record(kernel, count: int) -> None:
+    for launches in _recordings:
+        launches.append((f"{kernel.module.name}.{kernel.key}", count))
 
 
 @cache
@@ -62,6 +84,7 @@ def launch(kernel, count: int, inputs: list, device, threads: int = 0, split_min
     """
     if count <= 0:
         return
+    _record(kernel, count)
     step = slice_length(count, device, threads, split_min)
     if step >= count:
         wp.launch(kernel, dim=count, inputs=[0, *inputs], device=device)
@@ -80,6 +103,7 @@ def launch_bands(kernel, ranges: list[tuple[int, int]], bands: list[tuple[int, i
 
     The kernel's last two arguments are the rows [row_first, row_end) of its band; it writes nothing outside them.
     """
+    _record(kernel, sum(length for _, length in ranges))
     _load(kernel, device)
 
     def draw(band: tuple[int, int]) -> None:

@@ -6,7 +6,7 @@ The *eye frame* has world axes and its origin at the eye.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 import warp as wp
@@ -101,6 +101,11 @@ class Camera:
             orthographic=data.projection == "orthographic",
             path=data.path,
         )
+
+    def sees_as(self, other: Camera) -> bool:
+        """Whether another camera's pixels are the same rays, whatever prim either comes from."""
+        mine, theirs = (replace(camera, path="") for camera in (self, other))
+        return all(np.array_equal(getattr(mine, each.name), getattr(theirs, each.name)) for each in fields(mine))
 
     def view(self, scene: Scene) -> CameraView:
         """The device form, relative to the scene's origin."""

@@ -17,7 +17,7 @@ from warp_reflect.techniques import TECHNIQUES
 
 CLEARCOAT_MIN = 0.5  # a coat from here on is a mirror of its own (design: clearcoat >= 0.5)
 PREFERRED = ("planar", "quadric", "reflector_map")  # the exact and cheap first
-JUDGED_IN_PIXELS = ("quadric",)  # whether they apply depends on the view
+JUDGED_IN_PIXELS = ("planar", "quadric")  # whether they apply depends on the view
 METHODS = ("auto", "reference")
 REUSING = ("quadric", "reflector_map")  # know a bound on how far a virtual vertex drifts
 REC709_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
@@ -181,7 +181,7 @@ def prefer_forward(plan: Plan, earlier: Plan | None = None) -> Plan:
     scene, camera = plan.scene, plan.camera
     rows = []
     for row in plan.rows:
-        held = [(name, *_applies(scene, row.reflector, camera, name)) for name in PREFERRED]
+        held = [(name, *_applies(scene, row.reflector, camera, name, row.settings)) for name in PREFERRED]
         chosen = next(((name, reason) for name, applies, reason in held if applies), None)
         if row.technique == "raytraced" and not row.forced and plan.method == "auto" and chosen is not None:
             name, reason = chosen
@@ -270,7 +270,8 @@ def _pixel_counts(scene: Scene, camera: Camera, parts: list[int], settings: Sett
 
 
 def _row(scene, camera, settings, method, number, part_index, part, weight, pixels, notes) -> PlanRow:
-    reflector = Reflector(number, part_index, scene.body(part_index).convex)
+    looked_at = method != "auto" or pixels >= max(settings.few_pixels, 1)
+    reflector = Reflector(number, part_index, looked_at and scene.body(part_index).convex)
     technique, forced, reason = _technique(scene, reflector, camera, method, pixels, settings, part, notes)
     if method == "reference":
         settings = settings.replace(refine="off")
@@ -302,13 +303,16 @@ def _technique(scene, reflector, camera, method, pixels, settings, part, notes) 
             known = ", ".join(TECHNIQUES)
             notes.append(Note(part.prim_path, f"technique: got '{mirror.technique}', expected auto or one of {known}"))
     if method != "auto":
-        applies, reason = _applies(scene, reflector, camera, method)
+        applies, reason = _applies(scene, reflector, camera, method, settings)
         if applies:
             return method, True, f"asked for; {reason}"
         notes.append(Note(part.prim_path, f"{method} does not apply ({reason}); traced"))
         return "raytraced", False, f"{method} was asked for but does not apply: {reason}"
     if pixels == 0:
         return "raytraced", False, "not seen from the plan's camera: nothing is done, and rays serve another camera"
+    if pixels < settings.few_pixels:
+        why = f"{pixels} pixels, fewer than few_pixels={settings.few_pixels}: rays are cheapest, its shape is not looked at"
+        return "raytraced", False, why
     reasons = []
     traced = budget.predict(scene, part, "raytraced", pixels, settings)["ms"]
     for name in PREFERRED:
@@ -319,7 +323,7 @@ def _technique(scene, reflector, camera, method, pixels, settings, part, notes) 
                 f"not analysed by auto (at most {ANALYSED_MAX})"
             )
             break
-        applies, reason = _applies(scene, reflector, camera, name)
+        applies, reason = _applies(scene, reflector, camera, name, settings)
         if not applies:
             reasons.append(f"{name}: {reason}")
             continue
@@ -343,11 +347,11 @@ def _work(scene, reflector, camera: Camera, technique: str) -> tuple[bool, int, 
     return branches, passes, held
 
 
-def _applies(scene, reflector, camera: Camera, method: str) -> tuple[bool, str]:
+def _applies(scene, reflector, camera: Camera, method: str, settings: Settings) -> tuple[bool, str]:
     if camera.orthographic and method != "raytraced":
         return False, "orthographic camera: there is no eye to reflect from"
     if method in JUDGED_IN_PIXELS:
-        return TECHNIQUES[method].applies(scene, reflector, camera)
+        return TECHNIQUES[method].applies(scene, reflector, camera, settings.shape_px)
     return TECHNIQUES[method].applies(scene, reflector)
 
 
@@ -367,8 +371,8 @@ def _effects(scene, part, technique, pixels, weight, settings) -> dict[str, Effe
             "traced rays are exact already" if traced else f"refine={settings.refine}",
         ),
         "grid": Effect(
-            visible and technique == "reflector_map" and (settings.grid_share > 0.0 or settings.max_error_px > 0.0),
-            f"grid_share={settings.grid_share:g}, max_error_px={settings.max_error_px:g}"
+            visible and technique == "reflector_map" and (settings.grid_share > 0.0 or settings.grid_error_px > 0.0),
+            f"grid_share={settings.grid_share:g}, grid_error_px={settings.grid_error_px:g}"
             if technique == "reflector_map"
             else "only reflector maps are interpolated",
         ),

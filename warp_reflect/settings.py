@@ -75,11 +75,17 @@ class Settings:
     map_resolution: int = 128
     """Nodes along a cube edge of a reflector map. [nodes]"""
     grid_share: float = 0.0
-    """Interpolation grid: nodes as a fraction of the vertices; 0: every vertex is searched (but see `max_error_px`)."""
+    """Interpolation grid: nodes as a fraction of the vertices; 0: every vertex is searched (but see `grid_error_px`)."""
     grid_kind: str = "direction"
     """The grid holds: `direction` (one exact step a vertex), `slope` (positions, derivatives), `position` (the paper's)."""
-    max_error_px: float = 0.0
+    grid_error_px: float = 0.0
     """Vertices are interpolated over cells of any size while their estimated error stays below this; 0: off. [pixels]"""
+    shape_px: float = 0.5
+    """A mesh counts as a plane or a quadric where that shifts what it shows by at most this. [pixels]"""
+    few_pixels: int = 16
+    """A mirror seen at fewer pixels gets the cheapest technique, its shape not looked at; 0: none does. [pixels]"""
+    keep_static: bool = True
+    """A frame takes over what the previous one answered where neither the eye nor the world has moved."""
     reuse_px: float = 0.0
     """A virtual vertex of the previous frame is kept while the bound on its drift stays below this; 0: off. [pixels]"""
     occlusion: str = "exact"
@@ -108,7 +114,11 @@ class Settings:
         _require(self.search in SEARCHES, "search", self.search, f"one of {', '.join(SEARCHES)}")
         _require(0.0 <= self.grid_share <= 1.0, "grid_share", self.grid_share, "0 to 1")
         _require(self.grid_kind in GRID_KINDS, "grid_kind", self.grid_kind, f"one of {', '.join(GRID_KINDS)}")
-        _require(0.0 <= self.max_error_px <= 1.0e6, "max_error_px", self.max_error_px, "0 (off) or a number of pixels")
+        _require(
+            0.0 <= self.grid_error_px <= 1.0e6, "grid_error_px", self.grid_error_px, "0 (off) or a number of pixels"
+        )
+        _require(0.0 <= self.shape_px <= 1.0e6, "shape_px", self.shape_px, "0 to 1000000 pixels")
+        _require(0 <= self.few_pixels <= 1000000, "few_pixels", self.few_pixels, "0 to 1000000 pixels")
         _require(0.0 <= self.reuse_px <= 1.0e6, "reuse_px", self.reuse_px, "0 (off) or a number of pixels")
         _require(self.occlusion in OCCLUSIONS, "occlusion", self.occlusion, f"one of {', '.join(OCCLUSIONS)}")
         painted = self.occlusion == "painter" and self.refine != "off"

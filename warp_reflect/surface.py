@@ -271,6 +271,8 @@ def mirror_pixels(
     """
     device = scene.device
     width, height = gbuffer.camera.size
+    if not parts:
+        return {}, wp.zeros(width * height, dtype=int, device=device)
     patch_reflector = np.zeros(max(len(scene.patch_shapes), 1), np.int32)
     for reflector, part in parts.items():
         patch_reflector[scene.parts[part].patches] = reflector

@@ -236,7 +236,7 @@ def default_contenders(
                 for share in GRID_SHARES:
                     add(method, grid_kind=kind, grid_share=share, refine=refine)
             for error in ERRORS_PX:
-                add(method, max_error_px=error, refine=refine)
+                add(method, grid_error_px=error, refine=refine)
             for search, counts in (("midpoint", MIDPOINT_ITERATIONS), ("newton", NEWTON_ITERATIONS)):
                 for count in counts:
                     add(method, search=search, iterations=count, refine=refine)
@@ -256,7 +256,7 @@ def default_contenders(
 
 def paper_contenders(base: Settings) -> list[Contender]:
     """What the papers did, as far as their settings tell: straight virtual edges, nothing refined."""
-    paper = base.replace(refine="off", edge_px=0.0, grid_share=0.0, max_error_px=0.0, reuse_px=0.0)
+    paper = base.replace(refine="off", edge_px=0.0, grid_share=0.0, grid_error_px=0.0, reuse_px=0.0)
     midpoint = paper.replace(search="midpoint", iterations=max(MIDPOINT_ITERATIONS), grid_kind="position")
     painted = paper.replace(occlusion="painter")
     return [

@@ -4,7 +4,7 @@ Source: Estalella et al., "Accurate Interactive Specular Reflections on Curved O
 level-of-detail hierarchy of its section 8. What differs:
 - the cells are those of one octree over the scene, so that small meshes share them;
 - which level a vertex is interpolated from is decided per view, by an estimate of the interpolation error on the screen
-  (`vertices.edge_reach`): down to `max_error_px`, or until the solves asked for by `grid_share` are spent;
+  (`vertices.edge_reach`): down to `grid_error_px`, or until the solves asked for by `grid_share` are spent;
 - by default the grid holds *reflection directions* and each vertex takes one exact step from the interpolated one (fourth
   order instead of second, at the same count of solves); `grid_kind="slope"` holds virtual positions and their derivatives
   (third order, no map read per vertex); `grid_kind="position"` is the paper's interpolation of virtual positions;
@@ -44,7 +44,7 @@ from warp_reflect.techniques.vertices import SolveFrame, VertexView, empty_verti
 START_SHARE = 0.02  # nodes per vertex of the level a frame starts from: it costs little and is rarely good enough
 ROUNDS_MAX = 16
 ROUND_WORTH = 400  # vertices: solving fewer costs less than the launches of another round
-NODES_MAX = 0.15  # nodes per vertex that `max_error_px` may solve: where it asks for more, the grid saves little
+NODES_MAX = 0.15  # nodes per vertex that `grid_error_px` may solve: where it asks for more, the grid saves little
 BUDGET_ROUNDS = 2  # descents by `grid_share`: the second sees better estimates
 NODES_PER_CELL = 2.5  # of a surface's cells, shared corners counted in parts
 STRADDLING_COUNT = 16.0  # vertices of a cell at the hidden boundary below which nodes cost more than they save
@@ -112,7 +112,7 @@ def fill(
     settings: Settings,
     out_vertex: VertexView,
 ) -> dict[str, int]:
-    """Fill the vertices of a scene from a grid, solving as few as `max_error_px` or `grid_share` allow.
+    """Fill the vertices of a scene from a grid, solving as few as `grid_error_px` or `grid_share` allow.
 
     Args:
         solve: (points, out VertexView) -> None: the exact solution of every point, from `out.seed` where not zero.
@@ -189,8 +189,8 @@ class _Descent:
 
     def run(self) -> tuple[np.ndarray, np.ndarray]:
         """(cells to interpolate from or hidden, cells whose vertices are solved one by one)."""
-        by_error = self.settings.max_error_px > 0.0
-        asked = self.settings.max_error_px
+        by_error = self.settings.grid_error_px > 0.0
+        asked = self.settings.grid_error_px
         if self.settings.grid_kind == "direction":
             asked = min(asked, DIRECTION_PX)
         done, exact = [], []
@@ -332,7 +332,7 @@ def _interpolate(scene, cells, descent, cell, map, frame, view, camera, settings
     if settings.grid_kind == "position":
         launch(position_kernel, len(owner), [*inputs, view, out_vertex], device, settings.threads, split_min=split_min)
         return np.zeros(0, np.int32)
-    tolerance = settings.max_error_px / max(camera.fx, camera.fy) if settings.max_error_px > 0.0 else 1.0
+    tolerance = settings.grid_error_px / max(camera.fx, camera.fy) if settings.grid_error_px > 0.0 else 1.0
     failed = wp.zeros(len(cells.vertices), dtype=wp.uint8, device=device)
     inputs += [map.view, frame, view, tolerance, out_vertex, failed]
     launch(direction_kernel, len(owner), inputs, device, settings.threads, split_min=split_min)

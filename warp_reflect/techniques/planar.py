@@ -24,19 +24,25 @@ wp.set_module_options({"enable_backward": False})
 
 CONVERGED = wp.constant(int(Status.CONVERGED))
 HIDDEN = wp.constant(int(Status.HIDDEN))
-# Of the mirror's size: a mesh flatter than this is a plane. float32 points of a unit mesh carry 6e-8; a facet 1/100 of the
-# mirror's size that deviates by this turns the ray by 1e-3 of a degree, below a pixel.
+# Where no view is known: of the mirror's size, and a sine. Also what counts as exact: float32 points of a unit mesh carry
+# 6e-8; a facet 1/100 of the mirror's size that deviates by this turns the ray by 1e-3 of a degree, below a pixel.
 FLATNESS_MAX = 1.0e-6
 NORMAL_SINE_MAX = 1.0e-5  # of the angle between a shading normal and the plane's: a bent normal is a curved mirror
+SLIVER = 1.0e-6  # of the largest facet's area: the normal of a smaller one is rounding
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """The plane's frame: unit_from_scene puts it at z = 0, the reflecting side of its winding up."""
+    """The plane's frame: unit_from_scene puts it at z = 0, the reflecting side of its winding up.
+
+    Attributes:
+        exact: The mirror is the plane to rounding; else the plane gives the candidates, and refinement the hits.
+    """
 
     reflector: Reflector
     unit_from_scene: np.ndarray  # float64 [4, 4]
     bytes: int = 0
+    exact: bool = True
 
 
 @wp.kernel
@@ -79,26 +85,42 @@ def plane_crossing_kernel(
     out_point[i] = frame.eye_from_unit * (wp.vec3(p[0], p[1], 0.0) - frame.eye)
 
 
-def applies(scene: Scene, reflector: Reflector) -> tuple[bool, str]:
-    """A part whose points and shading normals agree with one plane."""
+def applies(
+    scene: Scene, reflector: Reflector, camera: Camera | None = None, shape_px: float = 0.5
+) -> tuple[bool, str]:
+    """A part whose points and normals agree with one plane.
+
+    Args:
+        camera: The view in whose pixels the deviation is judged; None: by `FLATNESS_MAX` and `NORMAL_SINE_MAX`.
+        shape_px: At most this much may it shift what is shown. [pixels]
+    """
     part = scene.parts[reflector.part]
-    point, normal, size = _plane(scene, part)
-    corners = scene.host_points[_corners(scene, part)].astype(np.float64)
-    height = float(np.abs((corners - point) @ normal).max()) / size
-    if height > FLATNESS_MAX:
-        return False, f"not flat: {height:.1e} of its size off its plane (at most {FLATNESS_MAX:.0e})"
-    sine = _normal_sine(scene, part, normal)
-    if sine > NORMAL_SINE_MAX:
-        return False, f"shading normals bend by a sine of {sine:.1e} (at most {NORMAL_SINE_MAX:.0e})"
-    return True, f"flat within {height:.1e} of its size"
+    plane = _plane(scene, part)
+    height, sine = _deviation(scene, part, *plane)
+    if camera is None or (height <= FLATNESS_MAX and sine <= NORMAL_SINE_MAX):
+        flat = f"{height:.1e} of its size off its plane (at most {FLATNESS_MAX:.0e})"
+        bent = f"normals off the plane's by a sine of {sine:.1e} (at most {NORMAL_SINE_MAX:.0e})"
+        if height > FLATNESS_MAX:
+            return False, f"not flat: {flat}"
+        return (False, f"not flat: {bent}") if sine > NORMAL_SINE_MAX else (True, f"flat: {flat}")
+    points = scene.host_points[np.unique(_corners(scene, part))].astype(np.float64)
+    nearest = float(np.linalg.norm(points - (camera.eye - scene.origin), axis=1).min())
+    # A plane moved by h moves its picture by 2 h, a normal turned by an angle turns the ray by twice that.
+    radians = 2.0 * (sine + height * plane[2] / max(nearest, 1.0e-300))
+    shift = radians * max(camera.fx, camera.fy)
+    if shift > shape_px:
+        return False, f"not flat: off its plane by up to {shift:.2g} px (at most shape_px={shape_px:g})"
+    return True, f"flat: off its plane by up to {shift:.2g} px (at most shape_px={shape_px:g})"
 
 
 def prepare(scene: Scene, reflector: Reflector, settings: Settings) -> Prepared:
     """The plane through the mirror's points."""
-    point, normal, size = _plane(scene, scene.parts[reflector.part])
-    matrix = plane_frame(point, normal, size)
+    part = scene.parts[reflector.part]
+    plane = _plane(scene, part)
+    height, sine = _deviation(scene, part, *plane)
+    exact = height <= FLATNESS_MAX and sine <= NORMAL_SINE_MAX
     # A plane never sees itself, closed or not.
-    return Prepared(replace(reflector, convex=True), matrix)
+    return Prepared(replace(reflector, convex=True), plane_frame(*plane), exact=exact)
 
 
 def plane_frame(point: np.ndarray, normal: np.ndarray, size: float) -> np.ndarray:
@@ -146,6 +168,7 @@ def reflect(
         camera,
         settings,
         history,
+        wary=not prepared.exact,
     )
 
 
@@ -169,10 +192,17 @@ def _plane(scene: Scene, part: PartRange) -> tuple[np.ndarray, np.ndarray, float
     return middle, normal, size
 
 
-def _normal_sine(scene: Scene, part: PartRange, normal: np.ndarray) -> float:
+def _deviation(scene: Scene, part: PartRange, point: np.ndarray, normal: np.ndarray, size: float):
+    """(largest height off a plane, of the size; largest sine between a normal that reflects and the plane's)."""
+    corners = scene.host_points[_corners(scene, part)].astype(np.float64) - point
+    height = float(np.abs(corners @ normal).max()) / size
     index = scene.host_normal_index[part.first_triangle : part.first_triangle + part.triangle_count]
-    index = index[index[:, 0] >= 0]
-    if not len(index):
-        return 0.0
-    shading = scene.host_normals[np.unique(index)].astype(np.float64)
-    return float(np.linalg.norm(np.cross(shading, normal), axis=1).max())
+    shading = scene.host_normals[np.unique(index[index[:, 0] >= 0])].astype(np.float64)
+    flat = corners[index[:, 0] < 0]
+    facets = np.cross(flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0])
+    area = np.linalg.norm(facets, axis=1)
+    large = area > SLIVER * area.max(initial=0.0)
+    facets = facets[large] / area[large, None]
+    # Facets are flat to the rounding of their points, which their height tells already.
+    shading = np.concatenate([shading, facets]) if height > FLATNESS_MAX else shading
+    return height, float(np.linalg.norm(np.cross(shading, normal), axis=1).max(initial=0.0))

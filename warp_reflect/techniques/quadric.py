@@ -21,9 +21,6 @@ from warp_reflect.techniques import pieces, planar, quadric_branches, quadric_pa
 from warp_reflect.techniques.pieces import Piece
 from warp_reflect.techniques.quadric_sheets import Sheet, sheets_of
 
-# Pixels. A mesh whose points and normals would shift the picture by more is no quadric; refinement starts from candidates
-# that are off by this, and a pixel next to the right one is a neighbour in all but the finest meshes.
-RESIDUAL_PX_MAX = 0.5
 # Of the size, and a sine: what is asked where no view is known.
 RESIDUAL_MAX = 1.0e-3
 
@@ -42,11 +39,15 @@ class Prepared:
     bytes: int = 0
 
 
-def applies(scene: Scene, reflector: Reflector, camera: Camera | None = None) -> tuple[bool, str]:
+def applies(
+    scene: Scene, reflector: Reflector, camera: Camera | None = None, shape_px: float = 0.5
+) -> tuple[bool, str]:
     """A part all of whose patches are analytic with a quadric among them, or a mesh that a quadric describes.
 
     Args:
         camera: The view in whose pixels the residual of a mesh is judged; None: by size.
+        shape_px: A mesh whose points and normals would shift the picture by more is no quadric. Refinement starts from
+            candidates that are off by this, and a pixel next to the right one is a neighbour in all but the finest meshes.
     """
     sheets = sheets_of(scene, reflector.part)
     analytic = scene.patch_shapes[scene.parts[reflector.part].patches[0]] is not None
@@ -60,8 +61,8 @@ def applies(scene: Scene, reflector: Reflector, camera: Camera | None = None) ->
     count = f" ({len(sheets)} patches)" if len(sheets) > 1 else ""
     if analytic:
         return True, f"analytic: {names}{count}" + _branches_text(scene, reflector, camera)
-    residual, unit, limit = _residual(scene, reflector.part, sheets, camera)
-    text = f"residual {residual:.2g} {unit} (at most {limit:g})"
+    residual, unit, limit = _residual(scene, reflector.part, sheets, camera, shape_px)
+    text = f"residual {residual:.2g} {unit} (at most {'' if camera is None else 'shape_px='}{limit:g})"
     if residual > limit:
         return False, f"mesh not recognised: nearest is {names}{count}, {text}"
     return True, f"mesh recognised as {names}{count}, {text}" + _branches_text(scene, reflector, camera)
@@ -169,7 +170,7 @@ def _towards(quadric: CanonicalQuadric, points: np.ndarray) -> CanonicalQuadric:
     return replace(quadric, axes=axes, size=size)
 
 
-def _residual(scene: Scene, part_index: int, sheets: list[Sheet], camera: Camera | None) -> tuple[float, str, float]:
+def _residual(scene: Scene, part_index: int, sheets: list[Sheet], camera: Camera | None, shape_px: float):
     """(residual, its unit, its limit): how far points and normals off the surfaces move what the mirror shows."""
     part = scene.parts[part_index]
     points = scene.host_points[part.first_vertex : part.first_vertex + part.vertex_count].astype(np.float64)
@@ -179,4 +180,4 @@ def _residual(scene: Scene, part_index: int, sheets: list[Sheet], camera: Camera
     if camera is None:
         return shift / size, "of its size", RESIDUAL_MAX
     nearest = float(np.linalg.norm(points - (camera.eye - scene.origin), axis=1).min())
-    return shift * max(camera.fx, camera.fy) / max(nearest, 1.0e-300), "px", RESIDUAL_PX_MAX
+    return shift * max(camera.fx, camera.fy) / max(nearest, 1.0e-300), "px", shape_px

@@ -199,7 +199,7 @@ def prepare(scene: Scene, reflector: Reflector, settings: Settings) -> Prepared 
         device=scene.device,
     )
     drawn = baking.baked_or_drawn(scene, part, faces, resolution, draw)
-    gridded = settings.grid_share > 0.0 or settings.max_error_px > 0.0
+    gridded = settings.grid_share > 0.0 or settings.grid_error_px > 0.0
     cells = grid.build(scene, part) if gridded else None
     return Prepared(reflector, drawn, drawn.unit_from_body, cells)
 

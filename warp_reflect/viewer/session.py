@@ -80,13 +80,13 @@ class Control:
 CONTROLS = (
     Control("method", "technique", (*METHODS, *TECHNIQUES)),
     Control("grid_share", "grid share", (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)),
-    Control("max_error_px", "max error (px)", (0.0, 0.1, 0.25, 0.5, 1.0, 2.0, 4.0)),
+    Control("grid_error_px", "grid error (px)", (0.0, 0.1, 0.25, 0.5, 1.0, 2.0, 4.0)),
     Control("iterations", "iterations", (0, 1, 2, 3, 4, 6, 9, 12, 16, 24)),
     Control("map_resolution", "map resolution", (8, 16, 32, 64, 128, 256, 512)),
     Control("reuse_px", "reuse (px)", (0.0, 0.1, 0.25, 0.5, 1.0, 2.0)),
     Control("refine", "refine", REFINEMENTS),
 )
-ZERO_WORDS = {"grid_share": "off", "max_error_px": "off", "iterations": "default", "reuse_px": "off"}
+ZERO_WORDS = {"grid_share": "off", "grid_error_px": "off", "iterations": "default", "reuse_px": "off"}
 
 
 @dataclass(frozen=True)
