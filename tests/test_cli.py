@@ -253,7 +253,7 @@ def test_bad_prim_is_a_note_or_with_strict_an_error(stage, call):
 def test_plan_is_text_or_json(stage, call):
     code, out, err = call("plan", stage)
     assert (code, err) == (0, "")
-    assert "/World/Mirror: " in out
+    assert "/World/Mirror " in out
     code, out, _ = call("plan", stage, "--json", "-w", "200", "--method", "reference")
     numbers = json.loads(out)
     assert code == 0

@@ -370,14 +370,14 @@ def trace_shadows_kernel(
 
 
 class Tracer:
-    """Owner of the triangle BVH of a scene, or of one of its parts alone.
+    """Owner of the triangle BVH of a scene, of one of its parts alone, or of those triangles that a mirror may show.
 
     Attributes:
         id: Handle for `trace_ray`; valid while this object lives. 0 for a scene without triangles, which has
             no structure and must not be queried.
     """
 
-    def __init__(self, scene: Scene, part: int | None = None):
+    def __init__(self, scene: Scene, part: int | None = None, seen: np.ndarray | None = None):
         # Not the scene itself, which owns this: the pair would wait for the garbage collector, a scene a frame.
         self._device, self._view = scene.device, scene.view
         self._mesh = None
@@ -385,6 +385,9 @@ class Tracer:
         if part is not None:
             own = scene.parts[part]
             triangles = triangles[own.first_triangle : own.first_triangle + own.triangle_count]
+        if seen is not None:
+            # Shrunk to a point, which no ray hits, the others keep the numbering.
+            triangles = np.where(seen[:, None], triangles, triangles[:, :1])
         if len(triangles):
             # The traversal wants flat indices. Copied: the structure's memory must not move.
             indices = wp.array(triangles.reshape(-1), dtype=wp.int32, device=scene.device)
@@ -453,7 +456,7 @@ def trace_pixels(
     """Follow the reflected rays of mirror pixels through the BVH and write their hits into the layer.
 
     Args:
-        scene: Its BVH is built if this is the first use.
+        scene: Its BVH, or that of what the mirror may show, is built if this is the first use.
         gbuffer: Names the facet each pixel starts on.
         pixels: The mirror pixels of a reflector.
         layer: Receives triangle, u, v, distance and status (CONVERGED, SKY, STEP_LIMIT) of the pixels asked.
@@ -469,7 +472,7 @@ def trace_pixels(
     if count == 0:
         return 0
     rays = [
-        wp.uint64(scene.tracer.id),
+        wp.uint64(scene.mirror_tracer(part).id),
         scene.view,
         gbuffer.triangle,
         pixels.pixel,
@@ -502,6 +505,9 @@ def own_obstacles(scene: Scene, gbuffer: GBuffer, pixels: MirrorPixels, part: in
         uint8 [pixels.count], 1 where the own body is in the way.
     """
     blocked = wp.zeros(pixels.count, dtype=wp.uint8, device=scene.device)
+    seen, own = scene.seen_in(scene.parts[part]), scene.parts[part].first_triangle
+    if seen is not None and not seen[own]:
+        return blocked
     body = body_of(scene, part, convex=False)
     body.alone = 1
     rays = [gbuffer.triangle, pixels.pixel, pixels.point, pixels.normal, pixels.direction]

@@ -220,12 +220,15 @@ def render_frame(scene: Scene, plan: Plan, camera: str | Camera | None = None, p
     settings = plan.settings
     view = plan.camera if camera is None else find_camera(scene, camera, plan.size)
     gbuffer, layers = reflect_scene(scene, plan, view, timer, previous)
-    kept = _kept(layers, previous)
-    if previous and gbuffer is previous.gbuffer and len(kept) == len(layers) and previous.plan.settings == settings:
+    kept, finish = _kept(layers, previous), _finish(scene, plan)
+    # What moves with time without moving anything, such as waves, is a finish.
+    same_time = finish is None or (previous and previous.scene.data.time == scene.data.time)
+    same_layers = previous and gbuffer is previous.gbuffer and len(kept) == len(layers)
+    if same_layers and same_time and previous.plan.settings == settings:
         picture = previous._picture
     else:
         with timer("shade"):
-            picture = shade.shade(scene, gbuffer, layers, settings.threads, settings.shadows, _finish(scene, plan))
+            picture = shade.shade(scene, gbuffer, layers, settings.threads, settings.shadows, finish)
     timings = timer.ms
     for id in layers.keys() - kept:
         for step, ms in layers[id].timings.items():

@@ -40,6 +40,11 @@ class PlanRow:
     settings: Settings
     predicted: dict[str, float]
 
+    @property
+    def name(self) -> str:
+        """The mirror's prim path, with which copy and which subset of it."""
+        return self.path + (f"[{self.instance}]" if self.instance else "") + (f":{self.subset}" if self.subset else "")
+
 
 @dataclass
 class Plan:
@@ -110,17 +115,21 @@ class Plan:
         width, height = self.camera.size
         lines = [f"{self.scene.data.source}  camera {self.camera.path}  {width}x{height}"]
         if not self.rows:
-            lines.append("no reflector: nothing is simulated beyond the direct picture")
-        for row in self.rows:
-            name = row.path + (f"[{row.instance}]" if row.instance else "") + (f":{row.subset}" if row.subset else "")
-            forced = " (forced)" if row.forced else ""
-            lines.append(
-                f"{row.reflector.id:3d} {name}: {row.technique}{forced}, {row.pixels} pixels, "
-                f"{row.predicted['ms']:.1f} ms predicted"
+            return "\n".join([*lines, "no reflector: nothing is simulated beyond the direct picture"])
+        names = [row.name for row in self.rows]
+        column = max(len("mirror"), *map(len, names))
+        technique = max(len("technique"), *(len(row.technique) + 7 * row.forced for row in self.rows))
+        lines.append(
+            f"  # {'mirror':{column}}  {'technique':{technique}}  {'pixels':>9}  {'error px':>8}  {'ms':>8}  {'kB':>8}"
+        )
+        for row, name in zip(self.rows, names, strict=True):
+            chosen = row.technique + " forced" * row.forced
+            numbers = (
+                f"{row.predicted['error_px']:8.2f}  {row.predicted['ms']:8.2f}  {row.predicted['bytes'] / 1e3:8,.0f}"
             )
-            lines.append(f"      {row.reason}")
-            for effect_name, effect in row.effects.items():
-                lines.append(f"      {'on ' if effect.on else 'off'} {effect_name}: {effect.reason}")
+            lines.append(f"{row.reflector.id:3d} {name:{column}}  {chosen:{technique}}  {row.pixels:9,d}  {numbers}")
+            lines.append(f"    {row.reason}")
+            lines += [f"    {'on ' if each.on else 'off'} {name}: {each.reason}" for name, each in row.effects.items()]
         return "\n".join(lines)
 
 
@@ -355,6 +364,14 @@ def _applies(scene, reflector, camera: Camera, method: str, settings: Settings) 
     return TECHNIQUES[method].applies(scene, reflector)
 
 
+def _collection(scene: Scene, part: PartRange) -> Effect:
+    seen = scene.seen_in(part)
+    if seen is None:
+        return Effect(False, "no collection named reflects: it shows everything")
+    count = int(seen.sum())
+    return Effect(True, f"its collection named reflects holds {count} of {len(seen)} triangles", {"triangles": count})
+
+
 def _effects(scene, part, technique, pixels, weight, settings) -> dict[str, Effect]:
     traced = technique == "raytraced"
     visible = pixels > 0
@@ -366,6 +383,7 @@ def _effects(scene, part, technique, pixels, weight, settings) -> dict[str, Effe
             f"mirror weight {weight:.2f} {bound}, {pixels} pixels" if visible else "not seen from the camera",
             {"weight": weight, "pixels": pixels},
         ),
+        "collection": _collection(scene, part),
         "refinement": Effect(
             visible and not traced and settings.refine != "off",
             "traced rays are exact already" if traced else f"refine={settings.refine}",

@@ -299,6 +299,8 @@ class Scene:
         self._reload = reload
         self._bodies: dict[int, Body] = {}
         self._part_tracers: dict = {}
+        self._mirror_tracers: dict = {}  # material -> the structure over what a mirror of it may show
+        self._seen: dict[int, np.ndarray] = {}  # material -> which triangles a mirror of it may show
         self.fits: dict = {}  # part -> the quadric nearest to it, found by the technique that asks
         self.segmentations: dict = {}  # part -> its sheets (`segments.Segmentation`), likewise
         self._pyramids: dict = {}
@@ -405,6 +407,32 @@ class Scene:
         from warp_reflect import bvh
 
         return bvh.Tracer(self)
+
+    def seen_in(self, part: PartRange) -> np.ndarray | None:
+        """Which triangles a mirror may show, bool [triangle_count], by its collection; None: all of them."""
+        mirror = self.data.materials[part.material].mirror
+        if mirror is None or mirror.reflects is None:
+            return None
+        if part.material not in self._seen:
+            members = frozenset(mirror.reflects)
+            seen = np.zeros(self.triangle_count, bool)
+            for other in self.parts:
+                if other.prim_path in members or (other.instance and other.instance.partition(":")[0] in members):
+                    seen[other.first_triangle : other.first_triangle + other.triangle_count] = True
+            self._seen[part.material] = seen
+        return self._seen[part.material]
+
+    def mirror_tracer(self, part: int):
+        """The owner of the structure for the rays of a mirror: the scene's, or one over what it may show (`seen_in`)."""
+        from warp_reflect import bvh
+
+        seen = self.seen_in(self.parts[part])
+        if seen is None:
+            return self.tracer
+        material = self.parts[part].material
+        if material not in self._mirror_tracers:
+            self._mirror_tracers[material] = bvh.Tracer(self, seen=seen)
+        return self._mirror_tracers[material]
 
     def part_tracer(self, part: int):
         """The owner of the ray acceleration structure of one part alone (`bvh.Tracer`), built at first use."""

@@ -14,7 +14,7 @@ import warp as wp
 
 from warp_reflect import raster
 from warp_reflect.layers import Camera, MirrorPixels
-from warp_reflect.scene import Scene
+from warp_reflect.scene import PartRange, Scene
 from warp_reflect.settings import Status
 from warp_reflect.techniques import virtual_mesh
 from warp_reflect.techniques.vertices import VertexView
@@ -55,10 +55,22 @@ def settle_culled(
     hidden = (status == int(Status.HIDDEN)).all(axis=1)
     gone = np.flatnonzero(hidden | _beside(solved, status, corners, pixels, camera, unit_per_scene))
     for k in gone:
-        members = slice(int(first[k]), int(first[k] + count[k]))
-        out_vertex.status[members].fill_(int(Status.UNREFLECTED))
-        out_vertex.screen[members].fill_(wp.vec4(0.0, 0.0, raster.DROPPED, 0.0))
+        _settle(int(first[k]), int(count[k]), out_vertex)
     return int(count[gone].sum())
+
+
+def settle_unseen(scene: Scene, mirror: PartRange, out_vertex: VertexView) -> None:
+    """Settle the vertices of prims that a mirror may not show (`Scene.seen_in`) as `Status.UNREFLECTED`."""
+    seen = scene.seen_in(mirror)
+    for part in scene.parts if seen is not None else ():
+        if part.triangle_count and not seen[part.first_triangle]:
+            _settle(part.first_vertex, part.vertex_count, out_vertex)
+
+
+def _settle(first: int, count: int, out_vertex: VertexView) -> None:
+    members = slice(first, first + count)
+    out_vertex.status[members].fill_(int(Status.UNREFLECTED))
+    out_vertex.screen[members].fill_(wp.vec4(0.0, 0.0, raster.DROPPED, 0.0))
 
 
 def _beside(solved, status, corners, pixels, camera, unit_per_scene) -> np.ndarray:

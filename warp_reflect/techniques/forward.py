@@ -236,6 +236,7 @@ def reflect(
                 scene, mesh.points, camera, gbuffer.view, history, curvature, settings, vertices
             )
             layer.statistics.update(reused=reused, reused_px=reused_px)
+        cull.settle_unseen(scene, part, vertices)
         if reflector.convex:
             layer.statistics["culled"] = cull.settle_culled(
                 scene, solve_apart, pixels, camera, unit_per_scene, vertices
@@ -276,7 +277,17 @@ def reflect(
         wary = wary or drawn > DENSE * pixels.count
         with timer("refine"):
             doubtful = refine.settle(
-                scene, gbuffer, pixels, target, mesh, layer, blocked, settings, trust_sky=failed == 0, wary=wary
+                scene,
+                gbuffer,
+                pixels,
+                target,
+                mesh,
+                layer,
+                blocked,
+                settings,
+                trust_sky=failed == 0,
+                wary=wary,
+                seen=scene.seen_in(part),
             )
         with timer("trace"):
             bvh.trace_pixels(

@@ -477,7 +477,10 @@ def reflect_branches(
         doubtful = covered[pixel // width - target.box[1], pixel % width - target.box[0]]
         blocked = wp.array(np.maximum(blocked.numpy(), doubtful).astype(np.uint8), dtype=wp.uint8, device=scene.device)
     with timer("refine"):
-        left = refine.settle(scene, gbuffer, pixels, target, together, layer, blocked, settings, trust_sky=False)
+        seen = scene.seen_in(part)
+        left = refine.settle(
+            scene, gbuffer, pixels, target, together, layer, blocked, settings, trust_sky=False, seen=seen
+        )
     with timer("trace"):
         bvh.trace_pixels(scene, gbuffer, pixels, layer, reflector.part, reflector.convex, left, settings.threads)
     layer.statistics.update(doubt=int(doubtful.sum()))

@@ -24,8 +24,8 @@ def applies(scene: Scene, reflector) -> tuple[bool, str]:
 
 
 def prepare(scene: Scene, reflector, settings: Settings) -> Prepared:
-    """Build the scene's BVH here, so that the first frame does not pay for it."""
-    _ = scene.tracer
+    """Build the BVH of what the mirror may show here, so that the first frame does not pay for it."""
+    scene.mirror_tracer(reflector.part)
     return Prepared(reflector.part, reflector.convex)
 
 

@@ -228,6 +228,7 @@ def settle(
     settings: Settings,
     trust_sky: bool,
     wary: bool = False,
+    seen: np.ndarray | None = None,
 ) -> wp.array:
     """Write the hits that a virtual picture settles into the layer.
 
@@ -239,6 +240,7 @@ def settle(
         trust_sky: No virtual triangle was dropped: an empty neighbourhood is sky.
         wary: The picture may be off by a part of a pixel: every candidate of the neighbourhood is
             tested, and what none of them is hit by directly is left to the BVH.
+        seen: Which triangles of the scene the mirror may show, see `Scene.seen_in`: a walk may end on another.
 
     Returns:
         int32 indices into `pixels` of what the BVH must decide.
@@ -265,6 +267,9 @@ def settle(
         settings.threads,
     )
     host = settled.numpy()
+    if seen is not None:
+        triangle = layer.triangle.numpy()
+        host = np.where((triangle >= 0) & ~seen[np.maximum(triangle, 0)], DOUBT, host)
     doubtful = np.flatnonzero(host == DOUBT).astype(np.int32)
     counts = np.bincount(host, minlength=4)
     layer.statistics.update(

@@ -40,7 +40,7 @@ class VirtualMesh:
 
     Attributes:
         points: vec3 [vertex_count], scene frame; the scene's own vertices first.
-        triangles: vec3i [triangle_count], without the mirror's own and without those that were cut.
+        triangles: vec3i [triangle_count], without the mirror's own, those it may not show and those that were cut.
         parents: int32 [triangle_count], the scene triangle each belongs to.
         patches: int32 [triangle_count], the scene patch each belongs to.
         estimated: uint8 [scene triangle_count], pieces along an edge by the estimate that was in force, 1 where whole.
@@ -215,12 +215,14 @@ def budget(scene: Scene) -> float:
 
 
 def cut_mesh(scene: Scene, part: PartRange, cuts: np.ndarray, estimated: np.ndarray, relaxed: float) -> VirtualMesh:
-    """Replace every triangle with cuts > 1 by its lattice; drop the mirror's own."""
-    own = slice(part.first_triangle, part.first_triangle + part.triangle_count)
-    cuts = cuts.copy()
-    cuts[own] = 1
-    kept = cuts == 1
-    kept[own] = False
+    """Replace every triangle with cuts > 1 by its lattice; drop the mirror's own, and what it may not show."""
+    dropped = np.zeros(scene.triangle_count, bool)
+    dropped[part.first_triangle : part.first_triangle + part.triangle_count] = True
+    seen = scene.seen_in(part)
+    if seen is not None:
+        dropped |= ~seen
+    cuts = np.where(dropped, 1, cuts)
+    kept = (cuts == 1) & ~dropped
     points, triangles, parents = [scene.host_points], [scene.host_triangles[kept]], [np.flatnonzero(kept)]
     count = scene.vertex_count
     for pieces in np.unique(cuts[cuts > 1]):

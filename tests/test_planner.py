@@ -1,0 +1,137 @@
+"""What a plan decides, and why: every decision with its measured value, its threshold and the setting that moves it."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from rooms import CHROME, identical, placed, plane_room, render, room, sphere
+
+import warp_reflect as wr
+from warp_reflect import launch
+from warp_reflect.scene import MirrorData, Scene
+
+SIZE = (160, 90)
+
+
+def planned(scene, camera=None, method="auto", **settings):
+    (row,) = wr.make_plan(scene, camera, SIZE, wr.Settings(**settings), method).rows
+    return row
+
+
+def looking_away(scene):
+    camera = wr.make_plan(scene, size=SIZE).camera
+    return dataclasses.replace(camera, right=-camera.right, forward=-camera.forward)
+
+
+@pytest.fixture(scope="module")
+def ball_room(device):
+    return Scene(room(sphere(), placed(0, 0, 0)).data, device)
+
+
+def test_mirror_out_of_view_costs_nothing(ball_room):
+    plan = wr.make_plan(ball_room, looking_away(ball_room), SIZE)
+    (row,) = plan.rows
+    assert row.pixels == 0 and not row.effects["reflection"].on and "not seen" in row.reason
+    assert row.predicted["ms"] == 0.0 and row.predicted["bytes"] == 0
+    with launch.recorded() as launches:
+        frame = wr.render_frame(ball_room, plan)
+    assert not frame.layers and not plan._prepared
+    assert not [name for name, _ in launches if "trace" in name or "techniques" in name or "mirror_pixels" in name]
+
+
+def test_tiny_mirror_gets_the_cheapest_without_a_look_at_its_shape(ball_room):
+    pixels = planned(ball_room).pixels
+    scene = Scene(ball_room.data, str(ball_room.device))
+    row = planned(scene, few_pixels=pixels + 1)
+    assert row.technique == "raytraced" and f"few_pixels={pixels + 1}" in row.reason and str(pixels) in row.reason
+    assert not scene._bodies, "its shape was looked at"
+    assert "few_pixels" not in planned(ball_room, few_pixels=pixels).reason
+
+
+@pytest.mark.parametrize("bump, flat", [(0.0, True), (2.0e-5, True), (2.0e-2, False)])
+def test_flat_mesh_is_a_plane_within_a_bound_in_pixels(bump, flat, device):
+    data = plane_room().data
+    data.meshes[0] = dataclasses.replace(data.meshes[0], points=data.meshes[0].points.copy())
+    data.meshes[0].points[4, 1] += bump  # the middle of 3 x 3 points, along the plane's normal
+    scene = Scene(data, device)
+    row = planned(scene, method="planar")
+    assert (row.technique == "planar") == flat
+    assert ("shape_px=0.5" in row.reason) == (bump > 0.0), row.reason
+    if flat:
+        assert identical(render(scene, "planar"), render(scene, "reference")) >= 0.999
+    else:
+        assert planned(scene, method="planar", shape_px=1e3).technique == "planar"
+
+
+@pytest.mark.parametrize("method", ["reference", "reflector_map", "quadric"])
+def test_second_frame_of_a_still_scene_recomputes_nothing(method, ball_room):
+    first = render(ball_room, method)
+    with launch.recorded() as launches:
+        second = wr.render_frame(ball_room, first.plan, previous=first)
+    assert launches == []
+    assert second.kept == {1} and second.layers[1] is first.layers[1]
+    np.testing.assert_array_equal(second["RGBA"], first["RGBA"])
+    assert np.abs(second["reflectionMotion"]).max() < 1.0e-3
+
+
+def test_still_frame_is_made_anew_where_asked_for_or_where_something_moved(ball_room):
+    first = render(ball_room, "quadric")
+    camera = dataclasses.replace(first.camera, eye=first.camera.eye + [0.01, 0.0, 0.0])
+    for frame in (
+        render(ball_room, "quadric", previous=first, keep_static=False),
+        render(ball_room, "quadric", previous=first, camera=camera),
+        render(ball_room, "reflector_map", previous=first),
+        render(Scene(ball_room.data, str(ball_room.device)), "quadric", previous=first),
+    ):
+        assert not frame.kept
+
+
+def test_one_setting_changed_on_a_still_scene_draws_the_same_pixels_anew(ball_room):
+    first = render(ball_room, "quadric")
+    second = render(ball_room, "quadric", previous=first, walk_hops=2)
+    assert not second.kept and second.gbuffer is first.gbuffer
+    np.testing.assert_array_equal(second["status"], first["status"])
+
+
+def chosen_room(mirror, where, seen, device):
+    """A room whose mirror shows some of its prims, and the same room with nothing but those and the mirror."""
+    data = room(mirror, where).data
+    paths = tuple(each.prim_path for each in data.instances if seen(each.prim_path))
+    asks = dataclasses.replace(CHROME, mirror=MirrorData("/mirror", reflects=paths))
+    all_of_it = dataclasses.replace(data, materials=[asks, data.materials[1]])
+    kept = [each for each in data.instances if each.prim_path in ("/mirror", *paths)]
+    return Scene(all_of_it, device), Scene(dataclasses.replace(data, instances=kept), device)
+
+
+@pytest.mark.parametrize("method", ["reference", "quadric", "reflector_map", "explosion_map"])
+@pytest.mark.parametrize("refine", ["exact", "off"])
+def test_mirror_shows_what_its_collection_names_and_nothing_else(method, refine, device):
+    # The last balls are left out: the others keep their ids.
+    scene, rest = chosen_room(sphere(), placed(0, 0, 0), lambda path: path in ("/floor", "/ball0", "/ball1"), device)
+    shown, expected = (render(each, method, refine=refine) for each in (scene, rest))
+    assert set(np.unique(shown["reflectedId"])) <= {0, 2, 3, 4}
+    assert shown["primId"].max() > 4, "the others are there, only not in the mirror"
+    # Left-out vertices change no other: away from the edges of what stands before the mirror the pictures are the same.
+    assert identical(shown, expected) >= 0.999
+    row = shown.plan.rows[0]
+    assert row.effects["collection"].on and "reflects" in row.effects["collection"].reason
+
+
+def test_planar_mirror_and_one_that_could_see_itself_obey_their_collection(device):
+    for method in ("planar", "reference"):
+        scene, rest = chosen_room(
+            plane_room().data.meshes[0],
+            plane_room().data.instances[0].world_from_object,
+            lambda path: path == "/floor",
+            device,
+        )
+        shown = render(scene, method)
+        assert shown.plan.rows[0].technique == ("planar" if method == "planar" else "raytraced")
+        assert set(np.unique(shown["reflectedId"])) == {0, 2}
+        assert identical(shown, render(rest, method)) >= 0.999
+
+
+def test_empty_collection_shows_the_sky_alone(device):
+    scene, _ = chosen_room(sphere(), placed(0, 0, 0), lambda path: False, device)
+    for method in ("reference", "quadric"):
+        assert not render(scene, method)["reflectedId"].any()
