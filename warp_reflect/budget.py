@@ -17,6 +17,10 @@ BRANCHES_US = (
     20.0  # per vertex of the scene, where all its reflection points on a concave side are searched (4 a search)
 )
 OWN_BODY_US = 0.25  # per pixel of a mirror that may see itself
+LOOK_UP_US = 0.12  # per mirror pixel: one bilinear look-up in a cube map
+MAP_TEXEL_US = 0.4  # per texel of a map that is drawn: its ray, its shading
+MAP_RASTER_US = 0.1  # per triangle and face of a map that is drawn
+MAP_TEXEL_BYTES = 24  # radiance and coverage, distance, triangle
 CURVED_SHARE = 2.0  # virtual vertices and triangles per one of the scene, where a curved mirror bends edges
 
 
@@ -46,6 +50,11 @@ def predict(
     traced = pixels * TRACE_US
     if technique == "raytraced" or pixels == 0:
         return {"error_px": 0.0, "ms": 1e-3 * traced / threads, "bytes": 0}
+    if technique == "environment":
+        texels = 6 * settings.environment_resolution**2
+        drawn = texels * MAP_TEXEL_US + 6 * scene.triangle_count * MAP_RASTER_US
+        work = pixels * LOOK_UP_US + (0.0 if settings.environment_update == "static" else drawn)
+        return {"error_px": 0.0, "ms": 1e-3 * work / threads, "bytes": texels * MAP_TEXEL_BYTES}
     vertices = scene.vertex_count - (part.vertex_count if part.is_whole else 0)
     forward = vertices * SEARCH_US + (scene.triangle_count - part.triangle_count) * RASTER_US
     if technique != "planar":

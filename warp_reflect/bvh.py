@@ -223,6 +223,7 @@ def trace_kernel(
     scene: SceneView,
     origins: wp.array(dtype=wp.vec3),
     directions: wp.array(dtype=wp.vec3),
+    body: OwnBody,
     out_triangle: wp.array(dtype=int),
     out_t: wp.array(dtype=float),
     out_u: wp.array(dtype=float),
@@ -230,7 +231,7 @@ def trace_kernel(
 ):
     """One thread per ray from free space."""
     i = first + wp.tid()
-    hit = trace_ray(mesh_id, scene, origins[i], directions[i], wp.vec3(0.0, 0.0, 0.0), -1, OwnBody(), 1)
+    hit = trace_ray(mesh_id, scene, origins[i], directions[i], wp.vec3(0.0, 0.0, 0.0), -1, body, 1)
     out_triangle[i] = hit.triangle
     out_t[i] = hit.t
     out_u[i] = hit.u
@@ -403,13 +404,16 @@ class Tracer:
         if self._mesh is not None:
             self._mesh.refit()
 
-    def trace(self, origins, directions, threads: int = 0) -> tuple[wp.array, wp.array, wp.array, wp.array]:
+    def trace(
+        self, origins, directions, threads: int = 0, without: OwnBody | None = None
+    ) -> tuple[wp.array, wp.array, wp.array, wp.array]:
         """First hits of rays from free space.
 
         Args:
             origins: Scene frame, finite, shape [n, 3] or a vec3 array.
             directions: Likewise, of unit length.
             threads: CPU threads; 0: one per core.
+            without: A convex `body_of` that is not there; a ray that crosses it more than `MAX_STEPS` times hits nothing.
 
         Returns:
             (triangle int32 [n], -1 none; t float32 [n]; u, v float32 [n], the weights of the second and third
@@ -422,7 +426,7 @@ class Tracer:
         triangle = wp.full(n, -1, dtype=int, device=device)
         t, u, v = (wp.zeros(n, dtype=float, device=device) for _ in range(3))
         if self._mesh is not None:
-            inputs = [wp.uint64(self.id), self._view, origins, directions, triangle, t, u, v]
+            inputs = [wp.uint64(self.id), self._view, origins, directions, without or OwnBody(), triangle, t, u, v]
             launch.launch(trace_kernel, n, inputs, device, threads)
         return triangle, t, u, v
 

@@ -1,6 +1,6 @@
-"""Direction <-> cube face, for node-centred cube maps.
+"""Direction <-> cube face: of node-centred reflector maps, and of texel-centred radiance maps (at the end).
 
-A direction x with max |x_i| = 1 lies on face 2 k + (x_k < 0) of the major axis k, at u = x[k+1] / |x_k|,
+Of reflector maps: a direction x with max |x_i| = 1 lies on face 2 k + (x_k < 0) of the major axis k, at u = x[k+1] / |x_k|,
 v = x[k+2] / |x_k| (indices modulo 3). Nodes lie at u_i = -1 + 2 i / (n - 1): nodes on an edge of the cube belong to
 both faces, so bilinear interpolation is continuous across faces without gutters. Texel (face, j, i) of a map of n
 nodes is element (face n + j) n + i.
@@ -74,3 +74,63 @@ def node_directions(resolution: int) -> np.ndarray:
         result[face, :, :, ku] = line[None, :]
         result[face, :, :, kv] = line[:, None]
     return result
+
+
+# Radiance cube maps: OpenEXR's orientation (ImfEnvmap.h), texel-centred. Face order +X -X +Y -Y +Z -Z; each face is the
+# picture of a camera at the centre. Rows: right, up, forward.
+RADIANCE_AXES = np.array(
+    [
+        [[0, 0, 1], [0, 1, 0], [1, 0, 0]],
+        [[0, 0, -1], [0, 1, 0], [-1, 0, 0]],
+        [[1, 0, 0], [0, 0, 1], [0, 1, 0]],
+        [[1, 0, 0], [0, 0, -1], [0, -1, 0]],
+        [[-1, 0, 0], [0, 1, 0], [0, 0, 1]],
+        [[1, 0, 0], [0, 1, 0], [0, 0, -1]],
+    ],
+    dtype=np.float64,
+)
+
+
+@wp.func
+def radiance_point(x: wp.vec3) -> CubePoint:
+    """Face of a radiance map and position on it, u to the right and v downwards, of a direction (any length but zero)."""
+    point = CubePoint()
+    ax = wp.abs(x[0])
+    ay = wp.abs(x[1])
+    az = wp.abs(x[2])
+    if ax >= ay and ax >= az:
+        point.face = wp.where(x[0] < 0.0, 1, 0)
+        point.u = wp.where(x[0] < 0.0, -x[2], x[2]) / ax
+        point.v = -x[1] / ax
+    elif ay >= az:
+        point.face = wp.where(x[1] < 0.0, 3, 2)
+        point.u = x[0] / ay
+        point.v = wp.where(x[1] < 0.0, x[2], -x[2]) / ay
+    else:
+        point.face = wp.where(x[2] < 0.0, 5, 4)
+        point.u = wp.where(x[2] < 0.0, x[0], -x[0]) / az
+        point.v = -x[1] / az
+    return point
+
+
+@wp.func
+def radiance_direction(face: int, u: float, v: float) -> wp.vec3:
+    """The direction of a position on a face of a radiance map, at length 1 along the face's axis."""
+    if face == 0:
+        return wp.vec3(1.0, -v, u)
+    if face == 1:
+        return wp.vec3(-1.0, -v, -u)
+    if face == 2:
+        return wp.vec3(u, 1.0, -v)
+    if face == 3:
+        return wp.vec3(u, -1.0, v)
+    if face == 4:
+        return wp.vec3(-u, -v, 1.0)
+    return wp.vec3(u, -v, -1.0)
+
+
+def texel_directions(resolution: int) -> np.ndarray:
+    """Directions of the texels' centres of a radiance map, at length 1 along their face's axis, float64 [6, n, n, 3]."""
+    line = (np.arange(resolution) + 0.5) * 2.0 / resolution - 1.0
+    right, up, forward = (RADIANCE_AXES[:, None, None, k] for k in range(3))
+    return forward + line[None, None, :, None] * right - line[None, :, None, None] * up

@@ -17,7 +17,7 @@ from warp_reflect.layers import Camera, GBuffer, MirrorPixels, ReflectionLayer, 
 from warp_reflect.planner import Plan, PlanRow, find_camera
 from warp_reflect.scene import Scene
 from warp_reflect.settings import Technique
-from warp_reflect.techniques import TECHNIQUES
+from warp_reflect.techniques import MAPS, TECHNIQUES
 from warp_reflect.timing import StageTimer
 from warp_reflect.virtual_objects import virtual_objects
 
@@ -319,9 +319,10 @@ def _is_still(previous: Frame | None, scene: Scene, plan: Plan, view: Camera) ->
 
 
 def _answered(previous: Frame, plan: Plan) -> dict[int, ReflectionLayer]:
-    """The layers of a still frame whose rows ask the same again."""
+    """The layers of a still frame whose rows ask the same again, and no map that is drawn in every frame."""
     asked, before = ({row.reflector.id: _request(row) for row in each.rows} for each in (plan, previous.plan))
-    return {id: layer for id, layer in previous.layers.items() if asked[id] == before[id]}
+    redrawn = {r.reflector.id for r in plan.rows if r.technique in MAPS and r.settings.environment_update != "static"}
+    return {id: layer for id, layer in previous.layers.items() if asked[id] == before[id] and id not in redrawn}
 
 
 def _request(row: PlanRow) -> tuple:
@@ -336,8 +337,12 @@ def _kept(layers: dict[int, ReflectionLayer], previous: Frame | None) -> frozens
 def _history(previous: Frame | None, scene: Scene, row: PlanRow):
     """What a reflector's search may start from: the previous frame's answers of the same technique in the same world.
 
-    At another time of the stage only where reuse is asked for: otherwise a frame of a range depends on no other.
+    Mirrors that show maps get those of all such mirrors of the previous frame. Others start, at another time of the stage,
+    only where reuse is asked for: otherwise a frame of a range depends on no other.
     """
+    if previous is not None and row.technique in MAPS:
+        method = Technique[row.technique.upper()]
+        return {number: layer.history for number, layer in previous.layers.items() if layer.method == method}
     if previous is None or row.reflector.id not in previous.layers:
         return None
     if previous.scene is not scene and not (row.settings.reuse_px > 0.0 and previous.scene.shares_world(scene)):

@@ -11,16 +11,15 @@ import numpy as np
 from warp_reflect import __version__, budget, raster
 from warp_reflect.effects import Effect, finish_effects
 from warp_reflect.layers import Camera, Reflector
-from warp_reflect.scene import Note, PartRange, Scene, reflectance
+from warp_reflect.reflectors import mirror_weight
+from warp_reflect.scene import Note, PartRange, Scene
 from warp_reflect.settings import Settings
-from warp_reflect.techniques import TECHNIQUES
+from warp_reflect.techniques import MAPS, TECHNIQUES
 
-CLEARCOAT_MIN = 0.5  # a coat from here on is a mirror of its own (design: clearcoat >= 0.5)
 PREFERRED = ("planar", "quadric", "reflector_map")  # the exact and cheap first
 JUDGED_IN_PIXELS = ("planar", "quadric")  # whether they apply depends on the view
 METHODS = ("auto", "reference")
 REUSING = ("quadric", "reflector_map")  # know a bound on how far a virtual vertex drifts
-REC709_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 DEFAULT_SIZE = (960, 540)  # usdrecord's default width at 16:9
 
 
@@ -237,21 +236,6 @@ def find_camera(scene: Scene, camera: str | Camera | None, size: tuple[int, int]
     return Camera.from_data((exact or matching)[0], (width, height))
 
 
-def mirror_weight(scene: Scene, part: PartRange, settings: Settings) -> float:
-    """Luminance of a part's mirror term at normal incidence; 0 where it is no mirror, by choice or by the settings."""
-    material = scene.data.materials[part.material]
-    f0, _ = reflectance(material)
-    weight = float(f0 @ REC709_LUMINANCE)
-    if material.mirror is not None:
-        return weight if material.mirror.include else 0.0
-    coated = material.clearcoat >= CLEARCOAT_MIN and material.clearcoat_roughness <= settings.reflector_max_roughness
-    if coated:
-        return max(weight, CLEARCOAT_MIN)
-    if material.roughness <= settings.reflector_max_roughness and weight >= settings.reflector_min_weight:
-        return weight
-    return 0.0
-
-
 # Triangles. Finding out what a larger mesh is (a quadric, convex sheets) takes seconds: `auto` leaves it where the outcome
 # is several sheets at best, or would lose against tracing even if it were one.
 ANALYSED_MAX = 20000
@@ -285,6 +269,8 @@ def _row(scene, camera, settings, method, number, part_index, part, weight, pixe
     if method == "reference":
         settings = settings.replace(refine="off")
     predicted = budget.predict(scene, part, technique, pixels, settings, *_work(scene, reflector, camera, technique))
+    if technique == "environment" and pixels:
+        predicted["error_px"] = TECHNIQUES[technique].parallax_px(scene, reflector, camera, settings.threads)
     return PlanRow(
         reflector,
         part.prim_path,
@@ -357,7 +343,7 @@ def _work(scene, reflector, camera: Camera, technique: str) -> tuple[bool, int, 
 
 
 def _applies(scene, reflector, camera: Camera, method: str, settings: Settings) -> tuple[bool, str]:
-    if camera.orthographic and method != "raytraced":
+    if camera.orthographic and method not in ("raytraced", *MAPS):
         return False, "orthographic camera: there is no eye to reflect from"
     if method in JUDGED_IN_PIXELS:
         return TECHNIQUES[method].applies(scene, reflector, camera, settings.shape_px)
@@ -373,7 +359,9 @@ def _collection(scene: Scene, part: PartRange) -> Effect:
 
 
 def _effects(scene, part, technique, pixels, weight, settings) -> dict[str, Effect]:
-    traced = technique == "raytraced"
+    traced, mapped = technique == "raytraced", technique in MAPS
+    searched = not traced and not mapped
+    no_search = "maps are looked up" if mapped else "no search"
     visible = pixels > 0
     chosen = scene.data.materials[part.material].mirror is not None
     bound = "chosen by name" if chosen else f">= {settings.reflector_min_weight} (reflector_min_weight)"
@@ -385,8 +373,12 @@ def _effects(scene, part, technique, pixels, weight, settings) -> dict[str, Effe
         ),
         "collection": _collection(scene, part),
         "refinement": Effect(
-            visible and not traced and settings.refine != "off",
-            "traced rays are exact already" if traced else f"refine={settings.refine}",
+            visible and searched and settings.refine != "off",
+            "traced rays are exact already"
+            if traced
+            else "maps are looked up: there is no candidate to refine"
+            if mapped
+            else f"refine={settings.refine}",
         ),
         "grid": Effect(
             visible and technique == "reflector_map" and (settings.grid_share > 0.0 or settings.grid_error_px > 0.0),
@@ -399,7 +391,7 @@ def _effects(scene, part, technique, pixels, weight, settings) -> dict[str, Effe
             f"reuse_px={settings.reuse_px:g}" if technique in REUSING else "no search that could be left out",
         ),
         "warm_start": Effect(
-            visible and not traced, "no search" if traced else "from the previous frame where one is given"
+            visible and searched, "from the previous frame where one is given" if searched else no_search
         ),
         "shadows": Effect(settings.shadows, f"shadows={settings.shadows}"),
         "second_bounce": Effect(False, "a mirror seen in a mirror shows its base and the dome, one level deep"),

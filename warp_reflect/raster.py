@@ -12,6 +12,7 @@ top-left rule); 8 sub-pixel bits as there.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -562,15 +563,33 @@ def row_bands(first: int, end: int, count: int) -> list[tuple[int, int]]:
     return list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
 
 
-def draw_scene(scene: Scene, camera: Camera, threads: int = 0) -> GBuffer:
-    """The eye view of a scene: per pixel the nearest triangle and its depth key."""
+def kept_triangles(scene: Scene, without: Collection[int]) -> list[tuple[int, int]]:
+    """Ranges [first, end) of a scene's triangles without those of some parts."""
+    gone = sorted((part.first_triangle, part.triangle_count) for k in without for part in (scene.parts[k],))
+    ranges, first = [], 0
+    for start, count in [*gone, (scene.triangle_count, 0)]:
+        if start > first:
+            ranges.append((first, start))
+        first = start + count
+    return ranges
+
+
+def draw_scene(scene: Scene, camera: Camera, threads: int = 0, without: Collection[int] = ()) -> GBuffer:
+    """The eye view of a scene: per pixel the nearest triangle and its depth key.
+
+    Args:
+        scene, camera: What is drawn, and from where.
+        threads: CPU threads; 0: one per core.
+        without: Parts that are left out, indices into `scene.parts`.
+    """
     device = scene.device
     view = camera.view(scene)
     width, height = camera.size
     target = make_target(view, (0, 0, width, height), device)
     screen = wp.empty(scene.vertex_count, dtype=wp.vec4, device=device)
     launch(project_kernel, scene.vertex_count, [scene.view.points, view, screen], device, threads)
-    rasterise(target, screen, scene.view.triangles, threads=threads)
+    for first, end in kept_triangles(scene, without):
+        rasterise(target, screen, scene.view.triangles[first:end], id_offset=first, threads=threads)
     triangle = wp.empty(width * height, dtype=int, device=device)
     depth_key = wp.empty(width * height, dtype=float, device=device)
     launch(resolve_kernel, width * height, [target.key, triangle, depth_key], device, threads)

@@ -60,6 +60,7 @@ SEARCHES = ("newton", "midpoint")
 GRID_KINDS = ("direction", "slope", "position")
 REFINEMENTS = ("exact", "strict", "off")
 OCCLUSIONS = ("exact", "painter")
+ENVIRONMENT_UPDATES = ("static", "frame", "previous")
 
 
 @dataclass(frozen=True)
@@ -97,10 +98,17 @@ class Settings:
     refine: str = "exact"
     """`exact` (every pixel gets the hit of an exact ray-triangle test), `strict` (all 3x3 candidates are tested for a nearer
     hit, not only those that rise above the surface: 2 to 3 times fewer wrong pixels), or `off` (the papers' picture)."""
+    environment_resolution: int = 256
+    """Texels along a cube edge of environment maps."""
+    environment_update: str = "static"
+    """A mirror's environment map is drawn: `static` (again only where the world changed), `frame` (in every frame), or
+    `previous` (in every frame, and mirrors seen in it show the maps of the frame before)."""
     walk_hops: int = 4
     """Neighbour triangles a refinement may walk over before the BVH decides."""
     complexity: str = "low"
     """`low`, `medium`, `high`, `veryhigh`: subdivision level 0-3, and the tessellation of gprims, as in usdrecord."""
+    bounces: int = 1
+    """Mirrors seen in mirrors, in mirrors ...: how many reflections are followed; beyond them a mirror shows the dome."""
     threads: int = 0
     """CPU threads of a launch; 0: one per core."""
     shadows: bool = False
@@ -130,6 +138,13 @@ class Settings:
         _require(0 <= self.iterations <= 1000, "iterations", self.iterations, "0 to 1000")
         _require(0.0 <= self.tolerance < 1.0, "tolerance", self.tolerance, "0 to 1 (a sine)")
         _require(8 <= self.map_resolution <= 2048, "map_resolution", self.map_resolution, "8 to 2048 nodes")
+        _require(1 <= self.bounces <= 8, "bounces", self.bounces, "1 to 8")
+        texels = self.environment_resolution
+        _require(4 <= texels <= 4096, "environment_resolution", texels, "4 to 4096 texels")
+        update = self.environment_update
+        _require(
+            update in ENVIRONMENT_UPDATES, "environment_update", update, f"one of {', '.join(ENVIRONMENT_UPDATES)}"
+        )
         _require(0 <= self.walk_hops <= 64, "walk_hops", self.walk_hops, "0 to 64")
         _require(0 <= self.threads <= 1024, "threads", self.threads, "0 (all cores) to 1024")
         _require(

@@ -1,0 +1,26 @@
+"""Which surfaces are mirrors."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from warp_reflect.scene import PartRange, Scene, reflectance
+from warp_reflect.settings import Settings
+
+CLEARCOAT_MIN = 0.5  # a coat from here on is a mirror of its own (design: clearcoat >= 0.5)
+REC709_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+
+
+def mirror_weight(scene: Scene, part: PartRange, settings: Settings) -> float:
+    """Luminance of a part's mirror term at normal incidence; 0 where it is no mirror, by choice or by the settings."""
+    material = scene.data.materials[part.material]
+    f0, _ = reflectance(material)
+    weight = float(f0 @ REC709_LUMINANCE)
+    if material.mirror is not None:
+        return weight if material.mirror.include else 0.0
+    coated = material.clearcoat >= CLEARCOAT_MIN and material.clearcoat_roughness <= settings.reflector_max_roughness
+    if coated:
+        return max(weight, CLEARCOAT_MIN)
+    if material.roughness <= settings.reflector_max_roughness and weight >= settings.reflector_min_weight:
+        return weight
+    return 0.0

@@ -1,0 +1,187 @@
+"""One environment map at a mirror's centre, looked up by the reflected direction: the classic baseline.
+
+Source: Blinn and Newell, Texture and Reflection in Computer Generated Images, CACM 1976; as a cube, Greene, Environment
+Mapping and Other Applications of World Projections, IEEE CG&A 1986. Exact for what is infinitely far; how far off it is
+elsewhere, `parallax_px` predicts. The mirror itself is left out of its map.
+
+Mirrors seen in the map show the domes (`bounces` 1), their own maps to a fixed depth, or their maps of the previous frame
+(`environment_update` "previous"), see `mirror_maps.py`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+
+from warp_reflect import bvh, raster, surface
+from warp_reflect.environment_maps import CubeMaps, look_up, render_maps
+from warp_reflect.layers import Camera, GBuffer, MirrorPixels, ReflectionLayer
+from warp_reflect.scene import Scene
+from warp_reflect.settings import Settings, Status, Technique
+
+PREVIEW_SIDE = 160  # pixels of the picture in which parallax is predicted; its pixels' errors vary slowly
+QUANTILE = (
+    0.99  # of the mirror's pixels that stay below the predicted parallax; the last per cent are at its silhouette
+)
+SINGULAR = 1.0e-9  # squared sine by which neighbouring pixels' rays must part for an error to be a number of pixels
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A mirror's map, unless every frame draws it: map `number` of `maps`, at `centre` (world, float64 [3])."""
+
+    part: int
+    centre: np.ndarray
+    maps: CubeMaps | None
+    number: int = 0
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What the next frame may start from: the map that this one showed in the mirror `part`."""
+
+    part: int
+    maps: CubeMaps
+    number: int
+
+
+def applies(scene: Scene, reflector) -> tuple[bool, str]:
+    """A map asks nothing of a mirror."""
+    return True, "a map at its centre shows what is far away"
+
+
+def centre_of(scene: Scene, part: int) -> np.ndarray:
+    """Middle of a part's box, world, float64 [3]."""
+    own = scene.parts[part]
+    faces = scene.host_triangles[own.first_triangle : own.first_triangle + own.triangle_count]
+    points = scene.host_points[np.unique(faces)].astype(np.float64) if len(faces) else np.zeros((1, 3))
+    return 0.5 * (points.min(axis=0) + points.max(axis=0)) + scene.origin
+
+
+def left_out(scene: Scene, part: int) -> tuple[int, ...]:
+    """The parts that a mirror does not show: itself, and what its collection does not name."""
+    seen = scene.seen_in(scene.parts[part])
+    others = (
+        ()
+        if seen is None
+        else (k for k, other in enumerate(scene.parts) if other.triangle_count and not seen[other.first_triangle])
+    )
+    return tuple({part, *others})
+
+
+def prepare(scene: Scene, reflector, settings: Settings) -> Prepared:
+    """Draw the mirror's map, where it is not drawn in every frame."""
+    centre = centre_of(scene, reflector.part)
+    if settings.environment_update != "static":
+        return Prepared(reflector.part, centre, None)
+    maps, number = _draw(scene, reflector.part, centre, settings)
+    return Prepared(reflector.part, centre, maps, number)
+
+
+def reflect(
+    scene: Scene,
+    prepared: Prepared,
+    gbuffer: GBuffer,
+    pixels: MirrorPixels,
+    camera: Camera,
+    settings: Settings,
+    history: dict[int, Shown] | None = None,
+) -> ReflectionLayer:
+    """Look every reflected direction up.
+
+    Args:
+        history: By reflector id the maps of the previous frame.
+
+    Returns:
+        A layer with `radiance`, status SKY and no hits: what a map shows has no place. Statistics `environment_maps`: maps
+        drawn in this frame.
+    """
+    layer = ReflectionLayer.empty(pixels, Technique.ENVIRONMENT, scene.device)
+    maps, number = prepared.maps, prepared.number
+    if maps is None:
+        before = history if settings.environment_update == "previous" else None
+        maps, number = _draw(scene, prepared.part, prepared.centre, settings, before)
+        layer.statistics["environment_maps"] = 1
+    layer.radiance = look_up(scene, maps, number, pixels.direction, threads=settings.threads)
+    layer.status.fill_(int(Status.SKY))
+    layer.history = Shown(prepared.part, maps, number)
+    return layer
+
+
+def _draw(scene: Scene, part: int, centre: np.ndarray, settings: Settings, before=None) -> tuple[CubeMaps, int]:
+    if settings.bounces > 1 or before:
+        from warp_reflect.techniques import mirror_maps
+
+        if before:
+            onward = mirror_maps.of_previous_frame(scene, before)
+        elif settings.environment_update == "previous":
+            onward = None  # the first frame
+        else:
+            onward = mirror_maps.of_depth(scene, settings, settings.bounces - 1)
+    else:
+        onward = None
+    resolution = settings.environment_resolution
+    options = {"onward": onward, "shadows": settings.shadows, "threads": settings.threads}
+    return render_maps(scene, centre[None], resolution, without=[left_out(scene, part)], **options), 0
+
+
+def parallax_px(scene: Scene, reflector, camera: Camera, threads: int = 0) -> float:
+    """How many pixels off an environment map at a mirror's centre shows things.
+
+    In a small picture each mirror pixel's ray is followed from the centre instead of the mirror: the point met is what the
+    map shows there. To first order it belongs where the mirror's reflected rays, followed from pixel to pixel, point to it.
+
+    Args:
+        scene: Its BVH is built if this is the first use.
+        reflector: The mirror.
+        camera: Whose pixels count.
+        threads: CPU threads; 0: one per core.
+
+    Returns:
+        The error below which `QUANTILE` of the mirror's pixels stay; 0 where it is not seen.
+    """
+    shrink = max(1.0, max(camera.size) / PREVIEW_SIDE)
+    size = tuple(max(1, round(side / shrink)) for side in camera.size)
+    scaled = {name: getattr(camera, name) / shrink for name in ("fx", "fy", "cx", "cy")}
+    small = dataclasses.replace(camera, size=size, **scaled)
+    gbuffer = raster.draw_scene(scene, small, threads)
+    found, _ = surface.mirror_pixels(scene, gbuffer, {reflector.id: reflector.part}, threads)
+    pixels = found[reflector.id]
+    if not pixels.count or not scene.tracer.id:
+        return 0.0
+    number = pixels.pixel.numpy()
+    point, ray = pixels.point.numpy().astype(np.float64), pixels.direction.numpy().astype(np.float64)
+    centre = centre_of(scene, reflector.part) - scene.origin
+    origins = np.tile(centre, (len(ray), 1))
+    body = bvh.body_of(scene, reflector.part, convex=True)
+    triangle, distance, _, _ = scene.mirror_tracer(reflector.part).trace(origins, ray, threads, body)
+    shown = centre + distance.numpy()[:, None].astype(np.float64) * ray
+    # Index of the pixels to the right and below.
+    place = np.full(size[0] * size[1] + size[0] + 1, -1)
+    place[number] = np.arange(len(number))
+    right = np.where((number + 1) % size[0] != 0, place[number + 1], -1)
+    below = place[number + size[0]]
+    asked = (triangle.numpy() >= 0) & (right >= 0) & (below >= 0)
+    if not asked.any():
+        return 0.0
+    target = shown[asked]
+
+    def miss(which: np.ndarray) -> np.ndarray:
+        """By how much reflected rays miss the targets: differences of unit vectors."""
+        to_target = target - point[which]
+        return ray[which] - to_target / np.maximum(np.linalg.norm(to_target, axis=1, keepdims=True), 1e-300)
+
+    here = miss(np.flatnonzero(asked))
+    across, down = miss(right[asked]) - here, miss(below[asked]) - here
+    # Least squares for the step (x, y): across x + down y = -here.
+    a, b, c = ((p * q).sum(axis=1) for p, q in ((across, across), (across, down), (down, down)))
+    d, e = -(across * here).sum(axis=1), -(down * here).sum(axis=1)
+    det = a * c - b * b
+    good = det > (SINGULAR * np.maximum(a, c)) * np.maximum(a, c)
+    safe = np.where(good, det, 1.0)
+    step = np.hypot((c * d - b * e) / safe, (a * e - b * d) / safe)
+    # Where neighbours' rays do not part, the picture is one direction wide: all of it is off.
+    step = np.where(good, step, np.where((here * here).sum(axis=1) > 0.0, max(size), 0.0))
+    return float(min(np.quantile(step, QUANTILE), max(size)) * shrink)
