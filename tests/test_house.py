@@ -25,7 +25,7 @@ FLOORS = {
     2: "scene reflectors environment_maps baked_maps segments layers bvh raster shade surface pictures textures normal_maps "
     "direct channels stage stage.*",
     3: "solve solver solve_device solve_plane solve_convex solve_map solve_general solve_qim solver_gradients mirrors "
-    "reflector_maps techniques techniques.* finishes finishes.*",
+    "refraction solve_refraction solver_arrays reflector_maps techniques techniques.* finishes finishes.*",
     4: "planner effects budget bake frame motion virtual_objects seen sweep sweep_report",
     5: "cli viewer viewer.* pipeline process progress cluster farm",
 }

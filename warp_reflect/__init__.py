@@ -1,6 +1,7 @@
 """Accurate specular reflections on curved objects for OpenUSD stages, in NVIDIA Warp, on CPU and CUDA.
 
-`load_stage` -> `make_plan` -> `render_frame` is the main path; `solve` is the bare reflection-point solver.
+`load_stage` -> `make_plan` -> `render_frame` is the main path; `solve` and `refract` are the bare solvers of the laws of
+reflection and refraction.
 """
 
 from importlib import import_module
@@ -15,6 +16,7 @@ _HOME = {
     "PlanarMirror": "mirrors",
     "QuadricMirror": "mirrors",
     "ReflectorMap": "reflector_maps",
+    "Refraction": "refraction",
     "Scene": "scene",
     "Settings": "settings",
     "Solution": "solver",
@@ -23,6 +25,7 @@ _HOME = {
     "compare_frames": "metrics",
     "load_stage": "stage.load",
     "make_plan": "planner",
+    "refract": "refraction",
     "render_frame": "frame",
     "solve": "solver",
 }

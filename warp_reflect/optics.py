@@ -92,6 +92,66 @@ def specular_residual(p: Any, n: Any, eye: Any, target: Any):
 
 
 @wp.func
+def refract(direction: Any, n: Any, ior: Any):
+    """The direction behind an interface; the zero vector where the ray is totally reflected.
+
+    Args:
+        direction: Unit, towards the interface.
+        n: Unit normal on the side that the ray comes from.
+        ior: Index of refraction behind the interface over that before it.
+    """
+    across = (direction - wp.dot(direction, n) * n) / ior
+    square = n.dtype(1.0) - wp.dot(across, across)
+    if not (square > n.dtype(0.0)):
+        return type(n)(n.dtype(0.0), n.dtype(0.0), n.dtype(0.0))
+    return across - wp.sqrt(square) * n
+
+
+@wp.func
+def snell_residual(p: Any, n: Any, eye: Any, target: Any, ior: Any):
+    """How far a path through an interface is off Snell's law: sin i - ior sin r, with the directions that sines have here.
+
+    Args:
+        p: Candidate point on the interface. [scene units]
+        n: Unit normal at `p`, on the eye's side.
+        eye: One end of the path. [scene units]
+        target: The other end, behind the interface.
+        ior: Index of refraction behind the interface over that before it.
+
+    Returns:
+        0 where the law holds; 1 where the ends are not on either side.
+    """
+    o = safe_normalize(eye - p)
+    v = safe_normalize(target - p)
+    if not (wp.dot(o, n) > n.dtype(0.0) and wp.dot(v, n) < n.dtype(0.0)):
+        return n.dtype(1.0)
+    w = o + ior * v
+    return wp.length(w - wp.dot(w, n) * n)
+
+
+@wp.func
+def dielectric_reflectance(cosine: Any, ior: Any):
+    """Fresnel's reflectance of unpolarised light at a dielectric; 1 where it is totally reflected.
+
+    Source: Fresnel's equations; Born and Wolf, Principles of Optics, 7th edition, section 1.5.2, equations 21 and 35.
+
+    Args:
+        cosine: Of the angle of incidence.
+        ior: Index of refraction behind the interface over that before it.
+    """
+    one = cosine.dtype(1.0)
+    c = wp.clamp(wp.abs(cosine), cosine.dtype(0.0), one)
+    square = one - (one - c * c) / (ior * ior)
+    if not (square > cosine.dtype(0.0)):
+        return one
+    behind = ior * wp.sqrt(square)
+    across = (c - behind) / (c + behind)
+    # ior^2 cos i - ior cos r, over the sum.
+    along = (ior * ior * c - behind) / (ior * ior * c + behind)
+    return cosine.dtype(0.5) * (across * across + along * along)
+
+
+@wp.func
 def virtual_point(p: Any, n: Any, eye: Any, target: Any, curvature: Any):
     """The virtual point in the form that a tangential error of `p` moves less on the screen.
 
