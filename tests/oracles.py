@@ -294,3 +294,44 @@ def exact_point(q: np.ndarray, eye: np.ndarray, target: np.ndarray, start: np.nd
         first = sum(w[i] * g[i] for i in range(3)) / sum(g[i] ** 2 for i in range(3))
         solution = mpmath.findroot(equations, [*start.tolist(), first], tol=1e-60, maxsteps=30)
         return np.array([float(solution[i]) for i in range(3)])
+
+
+def first_boxes(low, high, origins, directions, grow: float) -> tuple[np.ndarray, np.ndarray]:
+    """The first of many boxes that rays meet, every box asked: (distance [n], inf for none; starts within one [n]).
+
+    Args:
+        low, high: Corners of boxes with axes along the frame's, [k, 3]; may be infinite along the third.
+        origins, directions: Rays, [n, 3].
+        grow: The boxes are wider by so much on every side (narrower if negative), but never upside down along the third axis.
+    """
+    low, high = np.array(low, float), np.array(high, float)
+    low[:, :2] -= grow
+    high[:, :2] += grow
+    middle = np.where(np.isfinite(low[:, 2]), 0.5 * (low[:, 2] + high[:, 2]), -np.inf)
+    low[:, 2] = np.minimum(low[:, 2] - grow, np.where(np.isfinite(middle), middle, np.inf))
+    high[:, 2] = np.maximum(high[:, 2] + grow, middle)
+    t, within = np.full(len(origins), np.inf), np.zeros(len(origins), bool)
+    unit = np.asarray(directions, float)
+    unit = unit / np.abs(unit).max(axis=1, keepdims=True)
+    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+    for n, (o, d) in enumerate(zip(np.asarray(origins, float), unit, strict=True)):
+        start, end = np.zeros(len(low)), np.full(len(low), np.inf)
+        for axis in range(3):
+            if d[axis] == 0.0:
+                end[(o[axis] < low[:, axis]) | (o[axis] > high[:, axis])] = -1.0
+            else:
+                a, b = (low[:, axis] - o[axis]) / d[axis], (high[:, axis] - o[axis]) / d[axis]
+                start, end = np.maximum(start, np.minimum(a, b)), np.minimum(end, np.maximum(a, b))
+        met = start <= end
+        if met.any():
+            t[n] = start[met].min()
+        within[n] = ((low <= o) & (o <= high)).all(axis=1).any()
+    return t, within
+
+
+def column_boxes(heights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The columns of a heightfield of cells of size 1 as boxes without a bottom; what is not finite is no column."""
+    heights = np.asarray(heights, float)
+    y, x = np.nonzero(np.isfinite(heights))
+    tall = heights[y, x]
+    return np.stack([x, y, np.full(len(x), -np.inf)], axis=1), np.stack([x + 1, y + 1, tall], axis=1)

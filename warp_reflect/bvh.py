@@ -11,18 +11,12 @@ import numpy as np
 import warp as wp
 
 from warp_reflect import launch
+from warp_reflect.launch import FINITE_FLAGS
 from warp_reflect.layers import GBuffer, MirrorPixels, ReflectionLayer
 from warp_reflect.scene import Scene, SceneView
 from warp_reflect.settings import Status
 from warp_reflect.shapes import clamp_weights, facet_normal, intersect_triangle, max_abs
 
-# Warp's own default (the option replaces it) and one flag: without NaN the box test's min and max are single
-# instructions, which makes a query 1.5 to 1.8 times as fast. Warp's headers name NAN: no warnings about that.
-# CUDA builds ignore the option.
-FINITE_FLAGS = (
-    "-march=native -mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000"
-    " -mllvm=-slp-recursion-max-depth=4 -menable-no-nans -Wno-nan-infinity-disabled"
-)
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FINITE_FLAGS})
 
 FLOAT_EPS = wp.constant(1.1920929e-7)  # one ulp of 1 in float32

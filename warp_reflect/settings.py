@@ -61,6 +61,7 @@ GRID_KINDS = ("direction", "slope", "position")
 REFINEMENTS = ("exact", "strict", "off")
 OCCLUSIONS = ("exact", "painter")
 ENVIRONMENT_UPDATES = ("static", "frame", "previous")
+FIELDS = ("auto", "heightfield", "occupancy")
 
 
 @dataclass(frozen=True)
@@ -113,6 +114,12 @@ class Settings:
     """CPU threads of a launch; 0: one per core."""
     shadows: bool = False
     """Shadow rays towards distant lights."""
+    field_kind: str = "auto"
+    """What maps trace rays through: `heightfield`, `occupancy` (a 3-D grid), or `auto`, by `field_overhang`."""
+    field_cell: float = 0.0
+    """Edge of a column of the heightfield, or of a cell of the grid; 0: automatic. [scene units]"""
+    field_overhang: float = 0.02
+    """Share of the columns with free space under a roof above which `auto` takes the grid."""
     reflector_max_roughness: float = 0.05
     """A material rougher than this is not treated as a mirror."""
     reflector_min_weight: float = 0.2
@@ -146,6 +153,9 @@ class Settings:
             update in ENVIRONMENT_UPDATES, "environment_update", update, f"one of {', '.join(ENVIRONMENT_UPDATES)}"
         )
         _require(0 <= self.walk_hops <= 64, "walk_hops", self.walk_hops, "0 to 64")
+        _require(self.field_kind in FIELDS, "field_kind", self.field_kind, f"one of {', '.join(FIELDS)}")
+        _require(0.0 <= self.field_cell <= 1.0e9, "field_cell", self.field_cell, "0 (automatic) or a length")
+        _require(0.0 <= self.field_overhang <= 1.0, "field_overhang", self.field_overhang, "0 to 1")
         _require(0 <= self.threads <= 1024, "threads", self.threads, "0 (all cores) to 1024")
         _require(
             0.0 <= self.reflector_max_roughness <= 1.0,

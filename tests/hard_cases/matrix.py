@@ -6,7 +6,7 @@ name no test.
 
 from __future__ import annotations
 
-HEIGHTFIELD, MAPS = "layered_environment: heightfield traversal", "layered_environment: several reference maps"
+MAPS = "layered_environment: several reference maps"
 SOLVE, ROOTS, QUADRICS = "test_solve.py::test_", "test_solve_roots.py::test_", "test_solve_quadrics.py::test_"
 MAP, GRID, RASTER, HERE = (
     "test_reflector_map.py::test_",
@@ -14,6 +14,7 @@ MAP, GRID, RASTER, HERE = (
     "test_raster.py::test_",
     "test_matrix.py::test_",
 )
+FIELD = "test_heightfield.py::test_"
 TRACED, SCENES, READ, FORWARD = (
     "test_raytraced.py::test_",
     "test_scenes.py::test_",
@@ -119,7 +120,29 @@ MATRIX: dict[str, tuple[str, tuple[str, ...]]] = {
         "R beyond the aperture",
         (SOLVE + "plane_status", "test_quadric.py::test_solid_with_rims_is_solved_patch_by_patch"),
     ),
-    **{f"H{k:02d}": (HEIGHTFIELD, ()) for k in range(1, 17)},
+    "H01": ("direction -0 on a border", (FIELD + "negative_zero_on_a_border_steps_along_the_other_axis",)),
+    "H02": ("vertical ray", (FIELD + "vertical_ray_meets_its_column_at_a_finite_distance",)),
+    "H03": ("rays that are not finite, or zero", (FIELD + "rays_that_are_no_rays_get_a_status",)),
+    "H04": ("start outside, aimed in", (FIELD + "ray_from_outside_comes_in_through_the_box",)),
+    "H05": ("start on the far edge", (FIELD + "ray_from_the_far_edge_starts_in_the_last_column",)),
+    "H06": ("start on a border, backwards", (FIELD + "ray_from_a_border_starts_in_the_column_that_it_enters",)),
+    "H07": ("through corners", (FIELD + "diagonal_through_corners_goes_between_no_two_columns",)),
+    "H08": ("components of 1e-30, directions of 1e-38", (FIELD + "tiny_components_and_tiny_directions_are_scaled",)),
+    "H09": ("1,024 to 16,384 cells", (FIELD + "long_rays_stay_in_their_cells",)),
+    "H10": ("heights that are not finite", (FIELD + "columns_without_a_height_are_open",)),
+    "H11": ("ray at the height of a column", (FIELD + "ray_at_the_height_of_a_column_meets_it",)),
+    "H12": ("start below the ground", (FIELD + "start_below_the_ground_is_told",)),
+    "H13": ("grids of one cell and of none", (FIELD + "smallest_grids_and_none",)),
+    "H14": (
+        "no walk without an end",
+        (
+            FIELD + "step_limit_ends_a_walk_and_no_ray_of_the_corpus_reaches_it",
+            FIELD + "heightfield_answers_as_every_column_asked",
+            FIELD + "grid_of_cells_answers_as_every_cell_asked",
+        ),
+    ),
+    "H15": ("cells of 0.5 at 1e7", (FIELD + "cells_are_found_far_from_the_origin",)),
+    "H16": ("sinks below a roof within a cell", (FIELD + "ray_that_sinks_below_a_roof_within_a_cell_meets_it_there",)),
     **{f"E{k:02d}": (MAPS, ()) for k in range(1, 9)},
     "E09": (
         "samples of a picture that are no light",

@@ -12,8 +12,7 @@ import numpy as np
 import warp as wp
 
 from warp_reflect import raster
-from warp_reflect.bvh import FINITE_FLAGS
-from warp_reflect.launch import launch
+from warp_reflect.launch import FINITE_FLAGS, launch
 from warp_reflect.layers import GBuffer, MirrorPixels, ReflectionLayer
 from warp_reflect.scene import Scene, SceneView
 from warp_reflect.settings import Settings, Status
