@@ -174,7 +174,7 @@ def test_answers_that_are_there_already_are_kept(ball_room, kind):
         out = vertices_module.empty_vertices(scene.vertex_count, "cpu")
         kept = np.random.default_rng(1).random(scene.vertex_count) < share
         out.status.assign(np.where(kept, int(Status.SKY), 0).astype(np.uint8))
-        statistics = grid.fill(
+        statistics, _ = grid.fill(
             scene, prepared.grid, lambda points, found, asked=asked: asked.append(len(points)), solve_frame, prepared.map,
             frame.gbuffer.view, camera, (0, 0, *camera.size), frame.plan.settings, out,
         )  # fmt: skip

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import weakref
+from itertools import islice
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from PIL import Image
 
 import warp_reflect as wr
 from warp_reflect.viewer import export, inspector, panes
+from warp_reflect.viewer import session as session_module
 from warp_reflect.viewer.session import Session, heat_map, picture
 
 pytestmark = pytest.mark.gl
@@ -341,6 +343,111 @@ def test_picked_eye_lines_start_at_the_eye(window):
     camera = window.session.camera
     _, _, mesh = picked(window, "eye", camera.eye, tolerance=0.02)
     assert np.allclose(mesh.points[0] + window.session.scene.origin, camera.eye, atol=1e-5)
+
+
+@pytest.fixture
+def searching(ball_room):
+    """An inspector of a mirror whose vertices a grid holds and a map searches, both shown."""
+    session = Session(ball_room, size=SIZE, method="reflector_map", settings=wr.Settings(grid_error_px=1.0))
+    made = inspector.Inspector(session, off_screen=True, window_size=WINDOW)
+    made.pick(*reflecting_pixel(made, 0.4))
+    press(made, "i", "b")
+    yield made
+    made.plotter.close()
+
+
+def test_picked_cell_of_the_grid_tells_its_level(searching):
+    mesh, origin = searching.meshes["grid /mirror"], searching.session.scene.origin
+    corners = mesh.points.reshape(mesh.n_cells, 16, 3)[int(np.argmin(mesh.cell_data["level"]))]
+    # Something of the grid may stand before it: what is picked tells where it is itself.
+    point, cell, shown = picked(searching, "grid", 0.5 * (corners[0] + corners[1]) + origin, tolerance=0.005)
+    points = shown.get_cell(cell).points
+    low, high = points.min(axis=0), points.max(axis=0)
+    edge = float((high - low)[0])
+    to_faces = np.minimum(np.abs(point - origin - low), np.abs(point - origin - high))
+    assert np.sort(to_faces)[1] < 0.05 * edge  # on an edge: near two faces
+    assert (point - origin > low - 0.05 * edge).all() and (point - origin < high + 0.05 * edge).all()
+    largest = float(np.ptp(corners[:, 0]))
+    assert shown.cell_data["level"][cell] == mesh.cell_data["level"].min() + round(np.log2(largest / edge))
+    press(searching, "i")
+    assert "grid" not in searching.plotter.renderers[inspector.SPACE].actors
+
+
+PATHS = ("search path /mirror", "search path on the cube /mirror")
+
+
+def test_picked_place_of_the_search_is_the_mirror_point(searching):
+    pick, origin = searching.session.picks[-1], searching.session.scene.origin
+    point, _, _ = picked(searching, "search places", pick.mirror_point, tolerance=0.005)
+    # On the mirror or, before it on the same line of sight, on the cube.
+    ends = [searching.meshes[name].points[-1] + origin for name in PATHS]
+    assert np.linalg.norm(ends[0] - pick.mirror_point) < 0.002
+    assert min(np.linalg.norm(point - end) for end in ends) < 0.02
+    _, _, mesh = picked(searching, "search", pick.mirror_point, tolerance=0.01)
+    assert mesh.point_data["residual"].min() < 1e-4
+
+
+def test_picked_bisector_stands_at_its_node(searching):
+    field = searching.meshes["bisector field /mirror"]
+    k = int(field.point_data["residual"].argmax())
+    vector = field.point_data["bisector"][k]
+    at = field.points[k] + searching.session.scene.origin
+    step = 0.3 * inspector.ARROW_SHARE * field.length / 17 * vector / np.linalg.norm(vector)
+    point, cell, mesh = picked(searching, "bisectors", at + step, tolerance=0.005)
+    # The arrow that is drawn there, of the mirror or the cube, is that of the node it stands at.
+    shown = mesh.point_data["residual"][mesh.get_cell(cell).point_ids[0]]
+    fields = [searching.meshes[name] for name in ("bisector field /mirror", "bisector field on the cube /mirror")]
+    nodes = np.concatenate([each.points for each in fields]) + searching.session.scene.origin
+    residual = np.concatenate([each.point_data["residual"] for each in fields])
+    near = np.linalg.norm(nodes - point, axis=1).argsort()[:3]
+    assert np.abs(residual[near] - shown).min() < 1e-5
+    assert np.linalg.norm(nodes[near[0]] - point) < field.length / 17
+    press(searching, "b")
+    actors = searching.plotter.renderers[inspector.SPACE].actors
+    assert not {"bisectors", "search", "search places", "cube"} & set(actors)
+
+
+def test_picked_cube_stands_around_the_ball(searching):
+    side = searching.session.camera.right
+    corner = CENTRE + RADIUS * np.sign(side + 1e-9)
+    point, _, _ = picked(searching, "cube", corner, tolerance=0.01)
+    assert np.abs(point - CENTRE).max() == pytest.approx(RADIUS, rel=0.02)
+
+
+def test_plot_shows_the_present_point_and_the_sweep(window, monkeypatch):
+    every = session_module.quick_contenders
+    monkeypatch.setattr(session_module, "quick_contenders", lambda session: islice(every(session), 5))
+    window.session.settings = wr.Settings(refine="off", threads=1)
+    press(window, "s")
+    assert window.shows_tradeoff and len(window.session.tradeoff.marks) > 3
+    assert window.session.message.startswith("swept: ")
+    shown = pane_of(window, shot(window), inspector.REFERENCE)
+    marks = [*window.session.tradeoff.marks, *window.session.tradeoff.trail]
+    size = window.pane_size(inspector.REFERENCE)
+    last = window.session.tradeoff.trail[-1]
+    x, y = panes.plot_place(panes.plot_box(size), panes.plot_axes(marks), last.ms, last.off)
+    assert np.abs(shown[round(y), round(x)] - np.array(panes.ACCENT)).max() <= 2
+    press(window, "t")
+    box = panes.picture_box(size, SIZE)
+    middle = pane_of(window, shot(window), inspector.REFERENCE)[box.y + box.height // 2, box.x + box.width // 2]
+    assert np.abs(middle - picture(window.session.reference)[SIZE[1] // 2, SIZE[0] // 2]).max() <= 2
+
+
+def test_wheel_over_the_settings_turns_to_more_of_them(window):
+    left, bottom, width, height = window._pane_box(inspector.CONTROLS)
+    place = left + width / 2, bottom + height / 2
+    before, eye = [knob.name for knob in window._knobs()], window.session.camera.eye
+    for _ in range(3):
+        send(window, "MouseWheelBackwardEvent", *place)
+    assert [knob.name for knob in window._knobs()][:3] == before[3:6]
+    for _ in range(99):
+        send(window, "MouseWheelBackwardEvent", *place)
+    every = [name for name, _ in panes.knob_rows(window.session)]
+    assert [knob.name for knob in window._knobs()][-1] == every[-1]
+    for _ in range(99):
+        send(window, "MouseWheelForwardEvent", *place)
+    assert [knob.name for knob in window._knobs()] == before
+    assert np.array_equal(window.session.camera.eye, eye)
 
 
 # Windows that change and end.

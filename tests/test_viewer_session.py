@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import base64
 import io
+import json
 import re
+from itertools import islice, pairwise
 
 import numpy as np
 import pytest
@@ -15,7 +17,8 @@ import warp_reflect as wr
 from warp_reflect import cli
 from warp_reflect.layers import Camera
 from warp_reflect.scene import Scene, SceneData
-from warp_reflect.viewer import cameras, export, geometry, gl
+from warp_reflect.techniques.grid import CellUse
+from warp_reflect.viewer import cameras, export, geometry, gl, panes, tradeoff
 from warp_reflect.viewer import session as sessions
 from warp_reflect.viewer.session import Session
 
@@ -189,13 +192,15 @@ def test_technique_that_does_not_apply_is_told(plane_room):
 
 
 def test_every_position_of_every_control_is_possible(ball_room):
-    session = Session(ball_room, size=(48, 36))
+    settings = wr.Settings(refine="off")  # one value of `occlusion` asks for it
+    session = Session(ball_room, size=(48, 36), settings=settings)
     for control in sessions.CONTROLS:
+        before = session.value(control.name)
         for value in control.values:
             assert session.set(control.name, value), session.message
             assert session.value(control.name) == value
             assert control.shown(value)
-        session.set(control.name, control.values[0])
+        session.set(control.name, before)
 
 
 def test_settings_reach_the_frame_and_its_error(ball_room):
@@ -224,6 +229,88 @@ def test_cameras_and_times_of_a_moving_stage(moving):
     assert session.camera is held  # one that a hand moved stays
     session.turn_knob("camera", "/World/Side")
     assert np.allclose(session.frame.camera.eye, [8.0, 0.0, 0.0])
+
+
+def test_every_setting_that_a_loaded_stage_follows_has_a_knob():
+    known = {control.name: control for control in sessions.CONTROLS}
+    assert set(known) == {"method", *wr.Settings.names()} - set(sessions.AT_LOADING)
+    for name in set(known) - {"method"}:
+        default = getattr(wr.Settings(), name)
+        assert default in known[name].values and len(known[name].values) > 1
+        assert all(type(value) is type(default) for value in known[name].values)
+
+
+def test_more_knobs_than_room_are_turned_to(ball_room):
+    session = Session(ball_room, size=(48, 36))
+    every = [name for name, _ in panes.knob_rows(session)]
+    first = panes.knobs_of(session, (400, 280))
+    last = panes.knobs_of(session, (400, 280), 99)
+    assert [knob.name for knob in first] == every[: len(first)] and len(first) < len(every)
+    assert [knob.name for knob in last] == every[-len(last) :]
+    assert panes.controls_pane(session, (400, 280), None, 99).shape == (280, 400, 3)
+
+
+# Accuracy against time.
+
+
+def test_point_of_the_settings_moves_over_the_plot(ball_room):
+    session = Session(ball_room, size=SIZE, method="quadric")
+    session.measure()
+    session.measure()  # nothing changed: no second point
+    session.set("refine", "off")
+    drawn = session.measure()
+    exact, off = session.tradeoff.trail
+    assert (exact.name, off.name) == ("quadric", "quadric refine=off") and exact.technique == "quadric"
+    assert off.ms == session.frame.timings["reflect"]
+    assert off.off == pytest.approx(1.0 - drawn.within_half_px / drawn.interior_pixels)
+    assert off.off > exact.off
+    axes = panes.plot_axes(session.tradeoff.trail)
+    box = panes.plot_box((400, 300))
+    places = [panes.plot_place(box, axes, mark.ms, mark.off) for mark in (exact, off)]
+    assert places[1][1] < places[0][1]  # more error is higher up
+    image = panes.tradeoff_pane((400, 300), session.tradeoff)
+    assert tuple(image[round(places[1][1]), round(places[1][0])]) == panes.ACCENT
+    session.orbit(5, 0)
+    assert not session.tradeoff.trail  # another view has other errors
+
+
+def test_quick_sweep_measures_what_a_sweep_would(ball_room):
+    session = Session(ball_room, size=SIZE, method="quadric", settings=wr.Settings(threads=1))
+    names = list(islice(session.quick_sweep(), 4))  # of which nothing takes long
+    marks = {mark.name: mark for mark in session.tradeoff.marks}
+    assert set(marks) == {"reference", *names} and {"quadric", "quadric refine=off"} <= set(names)
+    assert marks["reference"].off == 0.0 and marks["quadric"].technique == "quadric"
+    drawn = wr.render_frame(
+        ball_room, wr.make_plan(ball_room, session.camera, SIZE, wr.Settings(refine="off"), "quadric")
+    )
+    found = wr.compare_frames(drawn, session.reference)
+    assert marks["quadric refine=off"].off == pytest.approx(1.0 - found.within_half_px / found.interior_pixels)
+    assert session.tradeoff.trail  # the present point stays
+    front = session.tradeoff.front()
+    assert all(a.ms <= b.ms and a.off > b.off for a, b in pairwise(front))
+    session.use_camera(session.camera)
+    assert not session.tradeoff.marks
+
+
+def test_results_of_a_sweep_are_read_or_refused(tmp_path):
+    row = {"name": "quadric", "reflect_ms": 3.5, "off_share": 0.25, "technique": "quadric"}
+    whole = {"stage": "/far/room.usda", "size": [96, 72], "rows": [row]}
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "results.json").write_text(json.dumps(whole))
+    read = tradeoff.read_results(tmp_path / "out")
+    assert read.marks == [tradeoff.Mark("quadric", 3.5, 0.25, "quadric")]
+    assert read.told == "room.usda at 96x72, out/results.json"
+    assert tradeoff.beside(tmp_path / "room.usda") is None  # no such stage
+    (tmp_path / "room.usda").write_text("#usda 1.0\n")
+    assert tradeoff.beside(tmp_path / "room.usda") == read
+    (tmp_path / "other.usda").write_text("#usda 1.0\n")
+    assert tradeoff.beside(tmp_path / "other.usda") is None
+    for bad in ("", "[]", "{}", json.dumps(whole | {"rows": [row | {"off_share": 7}]}), '{"size": [1]}', "\0\0"):
+        (tmp_path / "bad.json").write_text(bad)
+        with pytest.raises(ValueError, match=r"bad\.json: is no result of `warp-reflect sweep`"):
+            tradeoff.read_results(tmp_path / "bad.json")
+    with pytest.raises(OSError, match=r"none\.json: cannot be read"):
+        tradeoff.read_results(tmp_path / "none.json")
 
 
 # Pixels.
@@ -322,6 +409,112 @@ def test_traced_mirrors_get_virtual_objects_and_their_own_mesh(ball_room):
     assert found["scene"].n_cells + mirror.n_cells == ball_room.triangle_count
     assert set(found["scene"].cell_data["prim"]) == set(range(2, 13))
     assert np.allclose(mirror.field_data["origin"], ball_room.origin)
+
+
+def test_cells_of_the_interpolation_grid_hold_every_vertex_once():
+    scene = rooms.room(rooms.sphere(), rooms.placed(*CENTRE, RADIUS), floor_cells=60)
+    plan = wr.make_plan(scene, size=SIZE, method="reflector_map", settings=wr.Settings(grid_error_px=0.5))
+    frame = wr.render_frame(scene, plan)
+    mesh = geometry.meshes(plan, frame, searches=False)["grid /mirror"]
+    use, error, level = (mesh.cell_data[name] for name in ("use", "error_px", "level"))
+    assert mesh.cell_data["vertices"].sum() == scene.vertex_count - scene.parts[0].vertex_count
+    assert set(use) == {CellUse.INTERPOLATED, CellUse.HIDDEN, CellUse.SOLVED} and len(np.unique(level)) > 1
+    assert (error[use != CellUse.INTERPOLATED] == 0.0).all() and 0.0 < error.max() <= 0.5
+    assert mesh.cell_data["vertices"][use == CellUse.SOLVED].sum() <= frame.statistics["grid_exact"]
+    corners = mesh.points.reshape(mesh.n_cells, 16, 3)
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    edge = (high - low).astype(float)
+    assert np.allclose(edge, edge[:, :1], rtol=1e-3)  # cubes
+    assert np.allclose(edge[:, 0] * 2.0**level, edge[0, 0] * 2.0 ** level[0], rtol=1e-3)
+    # Of the whole box hidden: the segment to its middle meets the ball.
+    middle = 0.5 * (low + high)[use == CellUse.HIDDEN] + scene.origin
+    towards = unit(middle - plan.camera.eye)
+    foot = plan.camera.eye + np.einsum("ij,j->i", towards, CENTRE - plan.camera.eye)[:, None] * towards
+    assert (np.linalg.norm(foot - CENTRE, axis=1) < RADIUS).all()
+
+
+def test_grid_is_shown_where_one_is_used_alone(ball_room):
+    assert "grid /mirror" not in geometry.meshes(wr.make_plan(ball_room, size=SIZE, method="reflector_map"))
+
+
+@pytest.mark.parametrize("search", ["newton", "midpoint"])
+def test_search_path_descends_to_what_the_pixel_shows(ball_room, search):
+    session = Session(ball_room, size=SIZE, method="reflector_map", settings=wr.Settings(search=search, iterations=40))
+    rows, columns = np.nonzero(session.frame["reflectedId"] > 0)
+    for k in np.linspace(0, 0.8 * len(rows), 7).astype(int):  # not at the silhouette, where the midpoint rule crawls
+        pick = session.pick(int(columns[k]), int(rows[k]))
+        path = geometry.meshes(session.plan, session.frame, session.picks)["search path /mirror"]
+        residual, used = path.point_data["residual"], path.point_data["evaluations"]
+        assert (np.diff(residual) < 0.0).all() and (np.diff(used) > 0).all() and used[0] == 1
+        assert residual[-1] < 1e-4
+        # It ends at the mirror point that the ray of the pixel found, to the map's accuracy.
+        assert np.linalg.norm(path.points[-1] + ball_room.origin - pick.mirror_point) < 2e-3
+        on_cube = geometry.meshes(session.plan, session.frame, session.picks)["search path on the cube /mirror"]
+        away = on_cube.points + ball_room.origin - CENTRE
+        assert np.allclose(np.abs(away).max(axis=1), RADIUS, rtol=2e-3)
+        assert np.allclose(unit(away), unit(path.points + ball_room.origin - CENTRE), atol=2e-3)
+
+
+def test_search_path_ends_where_the_frame_s_search_ended(ball_room):
+    """The seeds a frame hands on are its searches' own answers: the path of the same point ends there, bit for bit."""
+    from warp_reflect.techniques.map_search import search_settings
+    from warp_reflect.techniques.search_field import search_path
+    from warp_reflect.techniques.vertices import solve_frame
+
+    for settings in (wr.Settings(), wr.Settings(search="midpoint"), wr.Settings(tolerance=1e-7)):
+        plan = wr.make_plan(ball_room, size=SIZE, method="reflector_map", settings=settings)
+        frame = wr.render_frame(ball_room, plan)
+        map = plan.prepared(plan.rows[0]).map
+        vertices = frame.layers[1].history.vertices
+        status, seed = vertices.status.numpy(), vertices.seed.numpy()
+        known = np.flatnonzero(status[: ball_room.vertex_count] == wr.Status.CONVERGED)
+        eye = np.array(solve_frame(ball_room, plan.camera, map.unit_from_body).eye)
+        assert len(known) > 50
+        for k in known[:: len(known) // 12]:
+            target = map.unit_from_body[:3, :3] @ ball_room.host_points[k] + map.unit_from_body[:3, 3]
+            path = search_path(map, eye, target, search_settings(settings, map.resolution), ball_room.device)
+            assert path.visible and np.allclose(path.cube[-1], seed[k], atol=2e-6)
+
+
+def test_bisector_field_is_the_papers(ball_room):
+    """On a ball everything is known: N, the bisector, and that following the field makes the angle smaller."""
+    session = Session(ball_room, size=SIZE, method="reflector_map")
+    rows, columns = np.nonzero(session.frame["reflectedId"] > 0)
+    pick = session.pick(int(columns[len(rows) // 3]), int(rows[len(rows) // 3]))
+    found = geometry.meshes(session.plan, session.frame, session.picks)
+    on_ball, on_cube = found["bisector field /mirror"], found["bisector field on the cube /mirror"]
+    assert on_ball.n_points == on_cube.n_points > 150
+
+    def tangential(points):
+        n = unit(points - CENTRE)
+        bisector = unit(unit(pick.eye - points) + unit(pick.reflected_point - points))
+        along = np.einsum("ij,ij->i", bisector, n)
+        return bisector - along[:, None] * n, np.linalg.norm(np.cross(bisector, n), axis=1) / along
+
+    points = on_ball.points + ball_room.origin
+    want, tangent = tangential(points)
+    steep = tangent < 2.0
+    assert steep.sum() > 100
+    assert np.abs(on_ball.point_data["bisector"] - want)[steep].max() < 3e-3
+    assert np.allclose(on_ball.point_data["residual"][steep], tangent[steep], atol=5e-3)
+    # The least angle is at the node nearest to the mirror point: the sink.
+    nearest = np.linalg.norm(points - pick.mirror_point, axis=1).argmin()
+    assert on_ball.point_data["residual"].argsort().tolist().index(nearest) < 4
+    # On the cube: along its faces, and downhill.
+    at = on_cube.points + ball_room.origin - CENTRE
+    field = on_cube.point_data["bisector"]
+    face = np.abs(at).argmax(axis=1)
+    inner = np.sort(np.abs(at), axis=1)[:, 1] < 0.95 * RADIUS
+    assert np.abs(field[np.arange(len(at)), face])[inner].max() < 1e-4 * RADIUS
+    moved = at + 0.1 * field
+    _, after = tangential(CENTRE + RADIUS * unit(moved))
+    far = inner & steep & (tangent > 0.05)
+    assert far.sum() > 50 and (after[far] < tangent[far]).all()
+
+
+def test_search_of_a_plane_or_a_traced_mirror_has_no_field(plane_room):
+    found = geometry.meshes(wr.make_plan(plane_room, size=SIZE, method="planar"))
+    assert not [name for name in found if name.startswith(("bisector", "search", "cube", "grid"))]
 
 
 def test_virtual_objects_of_a_mirror_together_are_the_same(ball_room):

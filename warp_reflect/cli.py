@@ -519,6 +519,8 @@ class ViewOptions:
     """Time code to begin at."""
     pick: Annotated[list[str] | None, Parameter(negative=())] = None
     """A pixel X,Y to ask; repeatable."""
+    sweep: str | None = None
+    """What `sweep` wrote, a folder or its results.json, for the plot of accuracy against time; else one beside the stage."""
 
 
 @app.command

@@ -271,6 +271,7 @@ class ReflectionLayer:
         timings: Milliseconds per step.
         history: What the next frame may start from.
         virtual: What a forward technique drew: `virtual_mesh.Drawn` of every piece and branch; empty where rays answered.
+        cells: What an interpolation grid ended with: `grid.UsedCells` of every piece that has one.
         radiance: vec3 [n], what is seen at each pixel where the technique knows it itself (environment maps); None: it is
             shaded at the hits.
     """
@@ -286,6 +287,7 @@ class ReflectionLayer:
     timings: dict = field(default_factory=dict)
     history: object = None
     virtual: list = field(default_factory=list)
+    cells: list = field(default_factory=list)
     radiance: wp.array | None = None
 
     @classmethod

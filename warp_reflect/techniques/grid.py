@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from enum import IntEnum
 
 import numpy as np
 import warp as wp
@@ -74,6 +75,34 @@ class Grid:
     start: np.ndarray
 
 
+class CellUse(IntEnum):
+    """What a frame did with the vertices of a cell."""
+
+    NONE = 0
+    INTERPOLATED = 1
+    HIDDEN = 2
+    """The mirror hides the whole cell: nothing was asked of its vertices."""
+    SOLVED = 3
+    """One by one: the cell straddles the hidden boundary, or its corners would have cost more."""
+
+
+@dataclass(frozen=True)
+class UsedCells:
+    """The cells that a frame ended with.
+
+    Attributes:
+        tree: Of which they are.
+        cell: int [n], indices of its cells; no two overlap.
+        use: uint8 [n], `CellUse`.
+        error_px: float64 [n], estimated error where INTERPOLATED, else 0. [pixels]
+    """
+
+    tree: Octree
+    cell: np.ndarray
+    use: np.ndarray
+    error_px: np.ndarray
+
+
 def build(scene: Scene, own: PartRange) -> Grid | None:
     """The octree over everything but the mirror's own vertices; None where there is nothing to reflect."""
     members = np.ones(scene.vertex_count, bool)
@@ -111,7 +140,7 @@ def fill(
     box: tuple[int, int, int, int],
     settings: Settings,
     out_vertex: VertexView,
-) -> dict[str, int]:
+) -> tuple[dict[str, int], UsedCells]:
     """Fill the vertices of a scene from a grid, solving as few as `grid_error_px` or `grid_share` allow.
 
     Args:
@@ -122,10 +151,10 @@ def fill(
         out_vertex: One entry per scene vertex, empty.
 
     Returns:
-        Statistics: `grid_vertices` of which `grid_nodes` and `grid_exact` solves were made, `grid_levels` used.
+        (statistics: `grid_vertices` of which `grid_nodes` and `grid_exact` solves were made, `grid_levels` used; the cells).
     """
     descent = _Descent(scene, cells, solve, frame, map, camera, box, settings, out_vertex)
-    interpolated, exact = descent.run()
+    interpolated, error, exact = descent.run()
     tree = cells.tree
     failed = _interpolate(scene, cells, descent, interpolated, map, frame, view, camera, settings, out_vertex)
     places = np.concatenate([_ranges(tree.first[exact], tree.count[exact]), failed]).astype(np.int32)
@@ -140,12 +169,15 @@ def fill(
         solve(points, solved)
         launch(scatter_kernel, len(places), [cells.order, listed, solved, out_vertex], scene.device, settings.threads)
     levels = np.unique(tree.level[interpolated])
-    return {
+    statistics = {
         "grid_vertices": len(cells.vertices) if descent.waiting_before is None else int(descent.waiting_before[-1]),
         "grid_nodes": descent.node_count,
         "grid_exact": len(places),
         "grid_levels": len(levels),
     }
+    use = np.r_[np.where(error < 0.0, CellUse.HIDDEN, CellUse.INTERPOLATED), np.full(len(exact), CellUse.SOLVED)]
+    error = np.r_[np.maximum(error, 0.0), np.zeros(len(exact))]
+    return statistics, UsedCells(tree, np.r_[interpolated, exact], use.astype(np.uint8), error)
 
 
 class _Descent:
@@ -187,13 +219,13 @@ class _Descent:
         first = self.cells.tree.first[cell]
         return self.waiting_before[first + self.cells.tree.count[cell]] - self.waiting_before[first]
 
-    def run(self) -> tuple[np.ndarray, np.ndarray]:
-        """(cells to interpolate from or hidden, cells whose vertices are solved one by one)."""
+    def run(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(cells to interpolate from or hidden, their errors [pixels], cells whose vertices are solved one by one)."""
         by_error = self.settings.grid_error_px > 0.0
         asked = self.settings.grid_error_px
         if self.settings.grid_kind == "direction":
             asked = min(asked, DIRECTION_PX)
-        done, exact = [], []
+        done, errors, exact = [], [], []
         cell = self.cells.start[self.waiting(self.cells.start) > 0]
         error = self._estimate(cell)
         rounds = ROUNDS_MAX if by_error else BUDGET_ROUNDS
@@ -208,12 +240,13 @@ class _Descent:
             direct = (wrong if by_error else unsafe) & ~split
             exact.append(cell[direct])
             done.append(cell[~split & ~direct])
+            errors.append(error[~split & ~direct])
             if not split.any():
                 break
             cell = self._below(cell[split], depth[split])
             cell = cell[self.waiting(cell) > 0]
             error = self._estimate(cell)
-        return np.concatenate(done), np.concatenate(exact)
+        return np.concatenate(done), np.concatenate(errors), np.concatenate(exact)
 
     def _depth(self, cell, error, tolerance) -> np.ndarray:
         """Levels to go down from cells until their error falls to the tolerance; 0 where solving the vertices is cheaper."""

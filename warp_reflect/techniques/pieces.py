@@ -83,6 +83,7 @@ def reflect(
             whole[name][chosen] = getattr(answer, name).numpy()
         layer.history[number] = answer.history
         layer.virtual += answer.virtual
+        layer.cells += answer.cells
         layer.statistics["pieces"] += 1
         add_statistics(layer.statistics, answer.statistics)
         add_statistics(layer.timings, answer.timings)

@@ -342,7 +342,7 @@ def reflect(
     chosen = search_settings(settings, prepared.map.resolution)
     if not prepared.map.closed and not settings.iterations:
         chosen.iterations = SHEET_EVALUATIONS
-    statistics = {}
+    statistics, used = {}, []
 
     def search(points, own: list[int], frame: SolveFrame, warm: bool, out_vertex: VertexView) -> None:
         inputs = [points, *own, prepared.map.view, frame, gbuffer.view, chosen, int(warm), out_vertex]
@@ -353,20 +353,20 @@ def reflect(
         if prepared.grid is None or not has_own:
             search(points, own, frame, warm, out_vertex)
             return
-        statistics.update(
-            grid.fill(
-                scene,
-                prepared.grid,
-                lambda asked, out: search(asked, [0, 0], frame, True, out),
-                frame,
-                prepared.map,
-                gbuffer.view,
-                camera,
-                pixels.box,
-                settings,
-                out_vertex,
-            )
+        counts, cells = grid.fill(
+            scene,
+            prepared.grid,
+            lambda asked, out: search(asked, [0, 0], frame, True, out),
+            frame,
+            prepared.map,
+            gbuffer.view,
+            camera,
+            pixels.box,
+            settings,
+            out_vertex,
         )
+        statistics.update(counts)
+        used.append(cells)
         if len(points) > scene.vertex_count:
             # Vertices of triangles that the previous frame cut.
             added = vertices_from(out_vertex, scene.vertex_count)
@@ -397,4 +397,5 @@ def reflect(
         wary=not prepared.map.closed,  # near its rim a sheet map feels the companion
     )
     layer.statistics.update(statistics)
+    layer.cells += used
     return layer

@@ -10,6 +10,7 @@ from warp_reflect.scene import Scene
 from warp_reflect.settings import Settings
 from warp_reflect.viewer import export, gl
 from warp_reflect.viewer.session import Session
+from warp_reflect.viewer.tradeoff import beside, read_results
 
 WIDTH = 640  # pixels of a frame; small enough to follow a hand on a CPU
 ASPECT = 4.0 / 3.0  # where no camera of the stage says otherwise
@@ -35,6 +36,8 @@ def check(shown) -> None:
         export.turntable_files(shown.turntable, shown.frames)
     for text in shown.pick or []:
         _pixel(text)
+    if shown.sweep:
+        read_results(shown.sweep)
     if shown.screenshot or shown.html or shown.turntable:
         return
     if not gl.library():
@@ -78,6 +81,9 @@ def run(session: Session, shown, say: Callable[[str], None]) -> Iterator[str]:
     Raises:
         ValueError, OSError: a pixel outside of the picture, a file that cannot be written.
     """
+    found = read_results(shown.sweep) if shown.sweep else beside(session.scene.data.source)
+    if found is not None:
+        session.tradeoff = found
     if session.message:
         yield session.message
     for text in shown.pick or []:

@@ -13,9 +13,10 @@ from warp_reflect.images import srgb_from_linear
 from warp_reflect.layers import Camera, ReflectionLayer
 from warp_reflect.planner import Plan, PlanRow, prefer_forward
 from warp_reflect.scene import Scene
-from warp_reflect.settings import Status
+from warp_reflect.settings import Status, Technique
 from warp_reflect.techniques.forward import History
 from warp_reflect.timing import StageTimer
+from warp_reflect.viewer.method import grid_mesh, search_meshes
 from warp_reflect.viewer.session import Pick
 from warp_reflect.virtual_objects import VirtualObject, virtual_objects
 
@@ -35,7 +36,7 @@ class Region(IntEnum):
 
 
 def meshes(
-    plan: Plan, frame: Frame | None = None, picks: Sequence[Pick] = (), *, apart: bool = True
+    plan: Plan, frame: Frame | None = None, picks: Sequence[Pick] = (), *, apart: bool = True, searches: bool = True
 ) -> dict[str, pv.PolyData]:
     """A planned view as meshes.
 
@@ -46,6 +47,7 @@ def meshes(
         plan: From `make_plan`. Mirrors that it traces, where a forward technique could answer, get virtual objects, too.
         frame: Of that plan; its camera is the eye. None: the plan's camera.
         picks: From `Session.pick`.
+        searches: With the field and the path of a search; their kernels take some seconds to compile the first time.
         apart: A mesh for each virtual object; else `virtual PATH`, all of a mirror's as one, which is much faster.
 
     Returns:
@@ -56,6 +58,12 @@ def meshes(
         `virtual PATH OBJECT`: an object as the mirror PATH shows it, behind the mirror; cells: `rgb`, `triangle` (of the
         scene), points: `source`, the object's own point;
         `reflection points PATH`: on the mirror, a point of the former each; points: `source`, `path_length`;
+        `grid PATH`: the interpolation grid's cells, a line around each; cells: `level` of the octree, `use` (`CellUse`),
+        `error_px`, `vertices`;
+        of a mirror that is searched in a map, for the point picked last in it (none: what its middle shows): `bisector
+        field PATH` on the mirror and `bisector field on the cube PATH` on the map's cube around it, the sink of whose
+        vectors (points: `bisector`, `residual`) is the reflection point; `cube PATH`; `search path PATH` and `search path
+        on the cube PATH`, the places the search takes (points: `residual`, `evaluations`);
         `rays`: of the picks, eye to mirror to reflected point, and on to the virtual point; cells: `virtual`, `pick`.
     """
     camera = plan.camera if frame is None else frame.camera
@@ -82,11 +90,37 @@ def meshes(
         own = [each for each in objects if each.reflector == row.reflector.id]
         if own:
             found["reflection points " + names[row.reflector.id]] = _reflection_points(scene, camera, own)
+    for row in plan.rows:
+        layer, name = layers.get(row.reflector.id), names[row.reflector.id]
+        if layer is None:
+            continue
+        if layer.cells:
+            found["grid " + name] = grid_mesh(layer.cells)
+        if searches and layer.method == Technique.REFLECTOR_MAP:
+            found |= _search_meshes(forward, row, layer, camera, picks, name)
     if picks:
         found["rays"] = ray_mesh(scene, picks)
     for mesh in found.values():
         mesh.field_data["origin"] = scene.origin
     return found
+
+
+def search_meshes_of(plan: Plan, frame: Frame, picks: Sequence[Pick]) -> dict[str, pv.PolyData]:
+    """Of `meshes` those of searches alone, for a frame's own mirrors."""
+    names, found = _names(plan), {}
+    for row in plan.rows:
+        layer = frame.layers.get(row.reflector.id)
+        if layer is not None and layer.method == Technique.REFLECTOR_MAP:
+            found |= _search_meshes(plan, row, layer, frame.camera, picks, names[row.reflector.id])
+    for mesh in found.values():
+        mesh.field_data["origin"] = plan.scene.origin
+    return found
+
+
+def _search_meshes(plan: Plan, row: PlanRow, layer: ReflectionLayer, camera: Camera, picks, name: str):
+    own = [pick for pick in picks if pick.reflected_point is not None and pick.reflector == row.path]
+    point = own[-1].reflected_point - plan.scene.origin if own else None
+    return {f"{kind} {name}": mesh for kind, mesh in search_meshes(plan, row, layer, camera, point)}
 
 
 def ray_mesh(scene: Scene, picks: Sequence[Pick]) -> pv.PolyData:

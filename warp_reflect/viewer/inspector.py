@@ -18,7 +18,7 @@ from pyvista import _vtk
 from warp_reflect.layers import Camera
 from warp_reflect.scene import Scene
 from warp_reflect.settings import Settings
-from warp_reflect.viewer import cameras, geometry, gl, panes
+from warp_reflect.viewer import cameras, geometry, gl, method, panes
 from warp_reflect.viewer.session import Session, heat_map, picture
 
 WINDOW = (1680, 1000)  # pixels
@@ -37,6 +37,9 @@ EVENT_PRIORITY = 10.0  # before the interactor style, whose priority is 0
 SPACE_BACK = tuple(c / 255.0 for c in panes.BACK)
 RAY_COLOR, VIRTUAL_COLOR, EYE_COLOR = "#ffb03a", "#e23cbe", "#6cc4ff"
 REGION_COLORS = ["#5a5f6a", "#4fae62", "#c2503f", "#5a7fc0"]  # by `geometry.Region`
+USE_COLORS = ["#5a5f6a", "#4fae62", "#c2503f", "#ff9a3a"]  # by `grid.CellUse`
+ARROW_SHARE = 0.6  # of a node's distance to the next, about
+RESIDUAL_SHOWN = 1.0  # tangent of the angle at the far end of the arrows' colours
 SPACE_SIDE = (0.30, 0.22, 0.10)  # where the 3-D view stands beside the eye: right, up, back, of the pivot's distance
 
 
@@ -80,7 +83,9 @@ class Inspector:
         session: The scene under inspection.
         plotter: The pyvista plotter.
         wipe: Share of the frame's width from where the reference is shown; 1: none of it.
-        whole_plan, shows_regions, shows_virtual: What the keys p, g and v switch.
+        whole_plan, shows_regions, shows_virtual, shows_grid, shows_search, shows_tradeoff: What the keys p, g, v, i, b and t
+            switch.
+        knobs_first: The first knob shown, where there are more than there is room for.
         meshes: What the 3-D pane shows, see `geometry.meshes`.
         stepwise: Leave measuring and the 3-D pane to the timer, so that a window answers between them.
     """
@@ -88,8 +93,10 @@ class Inspector:
     def __init__(self, session: Session, off_screen: bool | None = None, window_size: tuple[int, int] = WINDOW):
         self.session = session
         self.wipe = 0.75
-        self.whole_plan = self.shows_regions = False
+        self.whole_plan = self.shows_regions = self.shows_grid = self.shows_search = False
         self.shows_virtual = True
+        self.shows_tradeoff = bool(session.tradeoff.marks)
+        self.knobs_first = 0
         self.meshes: dict[str, pv.PolyData] = {}
         self._pending: list = []
         self._drag: str | None = None
@@ -148,7 +155,9 @@ class Inspector:
 
     def _show_space(self) -> None:
         session = self.session
-        self.meshes = geometry.meshes(session.plan, session.frame, session.picks, apart=False)
+        self.meshes = geometry.meshes(
+            session.plan, session.frame, session.picks, apart=False, searches=self.shows_search
+        )
         self._fill_space()
         self.draw()
 
@@ -185,10 +194,12 @@ class Inspector:
     def _pane_image(self, pane: int) -> np.ndarray:
         session, size = self.session, self.pane_size(pane)
         if pane == CONTROLS:
-            return panes.controls_pane(session, size, self._typed)
+            return panes.controls_pane(session, size, self._typed, self.knobs_first)
         if pane == TEXT:
             return panes.text_pane(session, size, self.whole_plan)
         waiting = "after the camera rests" if session.coarse else "measuring"
+        if pane == REFERENCE and self.shows_tradeoff:
+            return panes.tradeoff_pane(size, session.tradeoff, session.comparison is None)
         if pane == REFERENCE:
             shown = None if session.coarse else self._reference
             title = "reference: every mirror traced"
@@ -219,7 +230,7 @@ class Inspector:
     def _fill_space(self) -> None:
         self.plotter.subplot(*divmod(SPACE, COLUMNS))
         common = {"reset_camera": False, "render": False, "show_scalar_bar": False}
-        groups: dict[str, list[pv.PolyData]] = {"mirror": [], "virtual": [], "reflection points": []}
+        groups: dict[str, list[pv.PolyData]] = {"mirror": [], "virtual": [], "reflection points": [], "grid": []}
         for name, mesh in self.meshes.items():
             for kind, members in groups.items():
                 if name.startswith(kind + " ") and mesh.n_points:
@@ -234,10 +245,15 @@ class Inspector:
         self._add("mirror", _together(groups["mirror"]), color="#c8d4e4", opacity=0.35, **common)
         virtual = _together(groups["virtual"]) if self.shows_virtual else None
         self._add("virtual", virtual, scalars="rgb", rgb=True, ambient=0.5, diffuse=0.5, **common)
-        points = _together(groups["reflection points"])
+        covered = self.shows_search or self.shows_grid
+        points = None if covered else _together(groups["reflection points"])
         if points is not None:
             points = pv.PolyData(points.points[:: -(-points.n_points // POINTS_SHOWN)])
         self._add("points", points, color=RAY_COLOR, point_size=3, lighting=False, **common)
+        grids = groups["grid"] if self.shows_grid else []
+        look = {"scalars": "use", "cmap": USE_COLORS, "clim": (-0.5, 3.5), "line_width": 1, "lighting": False}
+        self._add("grid", _merged(grids), **look, **common)
+        self._fill_search(common)
         self._add("eye", self._eye_lines(), color=EYE_COLOR, line_width=2, lighting=False, **common)
         rays = self.meshes.get("rays")
         real = virtual = None
@@ -250,8 +266,39 @@ class Inspector:
         words = "3-D: mirror points, virtual objects in the mirrors, the eye"
         if self.shows_regions:
             words = "3-D: reflected green, hidden red, unreflected blue"
+        elif self.shows_search:
+            words = "3-D: projected bisectors on mirror and cube, the search's path"
+            if "search" not in self.plotter.renderers[SPACE].actors:
+                words = "3-D: no mirror here is searched in a map (method = reflector_map)"
+        elif self.shows_grid:
+            words = "3-D: grid: interpolated green, hidden red, solved one by one orange"
+            if not grids:
+                words = "3-D: no interpolation grid: grid share and grid error are off, or no map is searched"
         self._title(words)
         self.plotter.renderers[SPACE].ResetCameraClippingRange()
+
+    def _fill_search(self, common: dict) -> None:
+        """The field as arrows of one length, coloured by the angle to the law of reflection; the path as a line."""
+        fields, lines, cubes = [], [], []
+        for name, mesh in self.meshes.items() if self.shows_search else ():
+            if name.startswith("bisector field ") and mesh.n_points:
+                reach = ARROW_SHARE * mesh.length / method.FIELD_SIDE
+                vectors = mesh.point_data["bisector"]
+                lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
+                arrows = pv.PolyData(mesh.points)
+                arrows.point_data["arrow"] = reach * vectors / np.maximum(lengths, 1.0e-12)
+                arrows.point_data["residual"] = mesh.point_data["residual"]
+                fields.append(arrows.glyph(orient="arrow", scale="arrow", geom=pv.Arrow(tip_length=0.4)))
+            elif name.startswith("search path "):
+                lines.append(mesh)
+            elif name.startswith("cube "):
+                cubes.append(mesh)
+        look = {"scalars": "residual", "cmap": "viridis_r", "clim": (0.0, RESIDUAL_SHOWN), "lighting": False}
+        self._add("bisectors", _merged(fields), **look, **common)
+        self._add("search", _merged(lines), color=VIRTUAL_COLOR, line_width=5, lighting=False, **common)
+        ends = [pv.PolyData(mesh.points) for mesh in lines]
+        self._add("search places", _merged(ends), color=VIRTUAL_COLOR, point_size=8, lighting=False, **common)
+        self._add("cube", _merged(cubes), style="wireframe", color="#7a8090", lighting=False, **common)
 
     def _add(self, name: str, mesh: pv.DataSet | None, **look) -> None:
         if mesh is None or not mesh.n_points:
@@ -331,6 +378,9 @@ class Inspector:
         left, bottom, _, height = self._pane_box(pane)
         return x - left, height - 1 - (y - bottom)
 
+    def _knobs(self) -> list[panes.Knob]:
+        return panes.knobs_of(self.session, self.pane_size(CONTROLS), self.knobs_first)
+
     def _press(self, event: str) -> bool:
         interactor = self.plotter.iren.interactor
         x, y = interactor.GetEventPosition()
@@ -349,7 +399,7 @@ class Inspector:
             else:
                 self._drag = "pan" if event.startswith("Middle") or interactor.GetShiftKey() else "orbit"
         elif pane == CONTROLS and event.startswith("Left"):
-            for knob in panes.knobs_of(self.session, self.pane_size(CONTROLS)):
+            for knob in self._knobs():
                 inside = 0 <= local[1] - knob.track.y < knob.track.height
                 if inside and abs(knob.track.share_of(*local)[0] - 0.5) <= 0.5 + panes.KNOB_RADIUS / knob.track.width:
                     self._drag = "knob " + knob.name
@@ -361,7 +411,7 @@ class Inspector:
             return False
         x, y = self.plotter.iren.interactor.GetEventPosition()
         if self._drag.startswith("knob "):
-            knobs = panes.knobs_of(self.session, self.pane_size(CONTROLS))
+            knobs = self._knobs()
             knob = next((each for each in knobs if "knob " + each.name == self._drag), None)
             if knob is not None:
                 self._slide(knob, self._local(CONTROLS, x, y)[0])
@@ -403,6 +453,10 @@ class Inspector:
         if pane == FRAME:
             self.session.zoom(1.0 / ZOOM_STEP if "Forward" in event else ZOOM_STEP)
             self._show_moving()
+        elif pane == CONTROLS:
+            last = len(panes.knob_rows(self.session)) - len(self._knobs())
+            self.knobs_first = min(max(self.knobs_first + (-1 if "Forward" in event else 1), 0), last)
+            self.draw(CONTROLS)
         return pane != SPACE
 
     def _show_moving(self) -> None:
@@ -441,6 +495,7 @@ class Inspector:
         """Ask a pixel, say what it is, and show its ray."""
         self.session.pick(x, y)
         self.meshes["rays"] = geometry.ray_mesh(self.session.scene, self.session.picks)
+        self._update_search()
         self._fill_space()
         self.draw()
 
@@ -477,13 +532,50 @@ class Inspector:
             self.shows_regions = not self.shows_regions
         elif code == "v":
             self.shows_virtual = not self.shows_virtual
+        elif code == "i":
+            self.shows_grid = not self.shows_grid
+        elif code == "b":
+            self.shows_search = not self.shows_search
+            self._update_search()
+        elif code == "t":
+            self.shows_tradeoff = not self.shows_tradeoff
+            self.draw(REFERENCE)
+        elif code == "s":
+            self._sweep()
         elif code == "c":
             self.session.picks.clear()
             self.meshes.pop("rays", None)
-        if code in ("g", "v", "c"):
+            self._update_search()
+        if code in ("g", "v", "i", "b", "c"):
             self._fill_space()
             self.draw()
         return code not in ("q", "e")
+
+    def _update_search(self) -> None:
+        """Bring the search's meshes up to date with the last pick, where they are shown."""
+        session = self.session
+        if self.shows_search and not session.coarse:
+            self.meshes |= geometry.search_meshes_of(session.plan, session.frame, session.picks)
+
+    def _sweep(self) -> None:
+        """Measure this view with everything that applies, a contender a step, so that a window answers between."""
+        self.shows_tradeoff = True
+        self._rest()
+        names = self.session.quick_sweep()
+
+        def step() -> None:
+            name = next(names, None)
+            if name is None:
+                self.session.message = f"swept: {len(self.session.tradeoff.marks)} points"
+            else:
+                self.session.message = f"sweeping: {name}"
+                self._pending.append(step)
+            self.draw(REFERENCE, CONTROLS)
+
+        self._pending.append(step)
+        if not self.stepwise:
+            while self._pending:
+                self._pending.pop(0)()
 
     def _type(self, symbol: str, code: str) -> None:
         if symbol in ("Return", "KP_Enter"):
@@ -557,6 +649,14 @@ def _quiet_backend(off_screen: bool | None) -> Iterator[None]:
         yield
     finally:
         del os.environ[BACKEND]
+
+
+def _merged(meshes: list[pv.PolyData]) -> pv.PolyData | None:
+    """Meshes of any cells as one, with their data."""
+    meshes = [mesh for mesh in meshes if mesh.n_points]
+    if not meshes:
+        return None
+    return meshes[0] if len(meshes) == 1 else meshes[0].append_polydata(*meshes[1:])
 
 
 def _together(meshes: list[pv.PolyData]) -> pv.PolyData | None:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from warp_reflect.sweep import REFERENCE
 from warp_reflect.viewer.session import CLASS_COLORS, CONTROLS, ERROR_SHOWN_PX, PixelClass, Session, heat_colors
+from warp_reflect.viewer.tradeoff import Mark, Tradeoff
 
 BACK, RAISED, INK, DIM, ACCENT, WARN = (
     (24, 26, 30),
@@ -23,14 +27,28 @@ BACK, RAISED, INK, DIM, ACCENT, WARN = (
 TITLE_HEIGHT = 28  # pixels, as all below
 MARGIN = 8
 LINE_HEIGHT = 17
-ROW_HEIGHT = 36
+ROW_HEIGHT, ROW_HEIGHT_MIN = 32, 14
+FOOT_LINES = 7  # of text under the knobs
+KNOBS_MIN = 9  # shown at once, however small the pane
 TEXT_SIZE, TITLE_SIZE, MONO_SIZE = 14, 14, 12
 KNOB_RADIUS = 7
 PANE_MIN = 64  # a pane smaller than this is drawn at this size and shown smaller
+PLOT_LEFT = 54  # pixels for the labels of the axis
+MS_LEAST = 0.01  # of a plotted time
+PLOT_COLORS = {
+    "raytraced": (200, 200, 205),
+    "planar": (190, 130, 110),
+    "quadric": (88, 160, 220),
+    "reflector_map": (90, 190, 90),
+    "explosion_map": (225, 80, 70),
+    "environment": (170, 130, 210),
+    "layered_environment": (235, 140, 205),
+}
 TRACK = (0.36, 0.70)  # of the pane's width, where a knob's track begins and ends
 KEYS = (
-    "drag: orbit   shift-drag: pan   wheel: zoom   click: pick",
-    "p: plan   g: regions   v: virtual objects   c: forget picks",
+    "drag: orbit   shift-drag: pan   wheel: zoom, or more settings   click: pick",
+    "g: regions   v: virtual objects   i: interpolation grid   b: bisector field   c: forget picks",
+    "p: plan   t: accuracy against time   s: sweep this view",
     ": name=value sets any setting   q: quit",
 )
 
@@ -173,16 +191,25 @@ def error_pane(size: tuple[int, int], heat: np.ndarray | None, aspect: tuple[int
     return np.asarray(image)
 
 
-def knobs_of(session: Session, size: tuple[int, int]) -> list[Knob]:
-    """The knobs of a session and where they lie; camera and time where there is a choice."""
+def knob_rows(session: Session) -> list[tuple[str, tuple]]:
+    """(name, positions) of all knobs of a session; camera and time where there is a choice, before the settings."""
     rows: list[tuple[str, tuple]] = [(control.name, control.values) for control in CONTROLS]
     cameras = tuple(each.path for each in session.scene.data.cameras)
-    if len(cameras) > 1:
-        rows.append(("camera", cameras))
+    chosen = [("camera", cameras)] if len(cameras) > 1 else []
     if session.times:
-        rows.append(("time", session.times))
+        chosen.append(("time", session.times))
+    return rows[:1] + chosen + rows[1:]
+
+
+def knobs_of(session: Session, size: tuple[int, int], first: int = 0) -> list[Knob]:
+    """The knobs that there is room for, from the `first` on, and where they lie."""
+    rows = knob_rows(session)
     width = max(size[0], PANE_MIN)
-    height = min(ROW_HEIGHT, max((size[1] - TITLE_HEIGHT - 5 * LINE_HEIGHT) // len(rows), 14))
+    room = max(size[1] - TITLE_HEIGHT - FOOT_LINES * LINE_HEIGHT, ROW_HEIGHT_MIN)
+    count = max(min(len(rows), room // ROW_HEIGHT), min(len(rows), KNOBS_MIN))
+    height = min(ROW_HEIGHT, max(room // count, ROW_HEIGHT_MIN))
+    first = min(max(first, 0), len(rows) - count)
+    rows = rows[first : first + count]
     left, right = (round(share * width) for share in TRACK)
     return [
         Knob(name, values, Box(left, TITLE_HEIGHT + k * height, right - left, height))
@@ -199,12 +226,15 @@ def nearest(values: tuple, value) -> int:
     return int(np.argmin([abs(each - value) for each in values]))
 
 
-def controls_pane(session: Session, size: tuple[int, int], typed: str | None = None) -> np.ndarray:
-    """Knobs, the message, and what keys and buttons do."""
-    image, draw = _blank(size, "settings")
+def controls_pane(session: Session, size: tuple[int, int], typed: str | None = None, first: int = 0) -> np.ndarray:
+    """Knobs from the `first` on, the message, and what keys and buttons do."""
+    knobs, names = knobs_of(session, size, first), [name for name, _ in knob_rows(session)]
+    at = names.index(knobs[0].name)
+    hidden = len(knobs) < len(names)
+    counted = f": {at + 1} to {at + len(knobs)} of {len(names)}, wheel for more" if hidden else ""
+    image, draw = _blank(size, "settings" + counted)
     font, bold = _font("DejaVuSans", TEXT_SIZE), _font("DejaVuSans-Bold", TEXT_SIZE)
     labels = {control.name: control for control in CONTROLS}
-    knobs = knobs_of(session, size)
     for knob in knobs:
         box, control = knob.track, labels.get(knob.name)
         y = box.y + box.height // 2
@@ -212,7 +242,8 @@ def controls_pane(session: Session, size: tuple[int, int], typed: str | None = N
         shown = control.shown(value) if control else f"{value:g}" if knob.name == "time" else f"{value}"
         share = nearest(knob.values, value) / max(len(knob.values) - 1, 1)
         x = box.x + share * box.width
-        draw.text((MARGIN, y), control.label if control else knob.name, INK, font, anchor="lm")
+        label = _cut(draw, control.label if control else knob.name, font, box.x - KNOB_RADIUS - 2 * MARGIN)
+        draw.text((MARGIN, y), label, INK, font, anchor="lm")
         draw.rounded_rectangle((box.x, y - 2, box.x + box.width, y + 2), 2, RAISED)
         draw.rounded_rectangle((box.x, y - 2, max(x, box.x + 1), y + 2), 2, ACCENT)
         draw.ellipse((x - KNOB_RADIUS, y - KNOB_RADIUS, x + KNOB_RADIUS, y + KNOB_RADIUS), INK)
@@ -230,6 +261,96 @@ def controls_pane(session: Session, size: tuple[int, int], typed: str | None = N
         text = _cut(draw, line, small, image.width - 2 * MARGIN)
         draw.text((MARGIN, foot + k * LINE_HEIGHT), text, DIM, small)
     return np.asarray(image)
+
+
+def tradeoff_pane(size: tuple[int, int], tradeoff: Tradeoff, waiting: bool = False) -> np.ndarray:
+    """Share of wrong mirror pixels against milliseconds, both logarithmic: the sweep's points, and the present one.
+
+    Args:
+        size: (width, height) of the pane.
+        tradeoff: What is plotted.
+        waiting: The present point is not measured yet; the last one of the trail is of other settings.
+    """
+    image, draw = _blank(size, "accuracy against time" + (f": {tradeoff.told}" if tradeoff.told else ""))
+    small = _font("DejaVuSans", 11)
+    box = plot_box(size)
+    marks = [*tradeoff.marks, *tradeoff.trail]
+    draw.rectangle((box.x, box.y, box.x + box.width, box.y + box.height), outline=RAISED)
+    if not marks:
+        draw.text((image.width / 2, image.height / 2), "nothing measured in this view yet", DIM, small, anchor="mm")
+        return np.asarray(image)
+    axes = plot_axes(marks)
+    for decade in range(axes.left, axes.right + 1):
+        x, _ = plot_place(box, axes, 10.0**decade, 1.0)
+        draw.line((x, box.y, x, box.y + box.height), RAISED)
+        draw.text((x, box.y + box.height + 3), f"{10.0**decade:g}", DIM, small, anchor="ma")
+    for decade in range(axes.bottom, 1):
+        _, y = plot_place(box, axes, 1.0, 10.0**decade)
+        draw.line((box.x, y, box.x + box.width, y), RAISED)
+        label = "0" if decade == axes.bottom else f"{100.0 * 10.0**decade:g}%"
+        draw.text((box.x - 4, y), label, DIM, small, anchor="rm")
+    foot = image.height - MARGIN
+    draw.text((box.x, foot), "wrong mirror pixels over ms of reflections", DIM, small, anchor="ld")
+    front = [plot_place(box, axes, mark.ms, mark.off) for mark in tradeoff.front()]
+    for a, b in pairwise(front):
+        draw.line((*a, b[0], a[1]), DIM)
+        draw.line((b[0], a[1], *b), DIM)
+    for mark in tradeoff.marks:
+        x, y = plot_place(box, axes, mark.ms, mark.off)
+        draw.ellipse((x - 3, y - 3, x + 3, y + 3), PLOT_COLORS.get(mark.technique, DIM))
+        if mark.name == REFERENCE:
+            draw.text((x, y - 6), REFERENCE, INK, small, anchor="md")
+    trail = [plot_place(box, axes, mark.ms, mark.off) for mark in tradeoff.trail]
+    if len(trail) > 1:
+        draw.line(trail, ACCENT)
+    for x, y in trail[:-1]:
+        draw.ellipse((x - 2, y - 2, x + 2, y + 2), ACCENT)
+    if trail:
+        x, y = trail[-1]
+        draw.ellipse((x - 6, y - 6, x + 6, y + 6), None if waiting else ACCENT, INK)
+        mark = tradeoff.trail[-1]
+        text = f"{mark.name}: {mark.ms:.1f} ms, {100.0 * mark.off:.3g} % wrong" + ("  (measuring)" if waiting else "")
+        text = _cut(draw, text, small, box.width - 2 * MARGIN)
+        draw.text((box.x + box.width - MARGIN, box.y + MARGIN), text, INK, small, anchor="ra")
+    seen = dict.fromkeys(mark.technique for mark in tradeoff.marks if mark.technique in PLOT_COLORS)
+    x = image.width - MARGIN
+    for name in reversed(seen):
+        x -= round(draw.textlength(name, small)) + 16
+        if x < box.x + 250:
+            break
+        draw.text((x + 10, foot), name, DIM, small, anchor="ld")
+        draw.ellipse((x, foot - 10, x + 6, foot - 4), PLOT_COLORS[name])
+    return np.asarray(image)
+
+
+@dataclass(frozen=True)
+class PlotAxes:
+    """Decades that a plot spans: of time from left to right, of error from the bottom (which stands for none) to 1."""
+
+    left: int
+    right: int
+    bottom: int
+
+
+def plot_box(size: tuple[int, int]) -> Box:
+    """Where the plot lies in its pane."""
+    width, height = (max(side, PANE_MIN) for side in size)
+    return Box(PLOT_LEFT, TITLE_HEIGHT + 4, max(width - PLOT_LEFT - 2 * MARGIN, 8), max(height - TITLE_HEIGHT - 44, 8))
+
+
+def plot_axes(marks: list[Mark]) -> PlotAxes:
+    """Axes that hold all marks."""
+    times = [max(mark.ms, MS_LEAST) for mark in marks]
+    errors = [mark.off for mark in marks if mark.off > 0.0]
+    left, right = math.floor(math.log10(min(times))), math.ceil(math.log10(max(times)))
+    return PlotAxes(left, max(right, left + 1), min(math.floor(math.log10(min(errors, default=0.1))) - 1, -2))
+
+
+def plot_place(box: Box, axes: PlotAxes, ms: float, off: float) -> tuple[float, float]:
+    """Where a mark lies in the pane, pixels from its top left."""
+    across = (math.log10(max(ms, MS_LEAST)) - axes.left) / (axes.right - axes.left)
+    up = (math.log10(max(off, 10.0**axes.bottom)) - axes.bottom) / -axes.bottom
+    return box.x + across * box.width, box.y + (1.0 - up) * box.height
 
 
 def text_pane(session: Session, size: tuple[int, int], whole_plan: bool = False) -> np.ndarray:

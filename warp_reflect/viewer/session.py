@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from time import perf_counter
 
@@ -18,9 +19,11 @@ from warp_reflect.layers import Camera
 from warp_reflect.metrics import Comparison, PixelClass, compare_frames
 from warp_reflect.planner import METHODS, Plan, find_camera, make_plan
 from warp_reflect.scene import Scene
-from warp_reflect.settings import REFINEMENTS, Settings, Status, Technique
+from warp_reflect.settings import Settings, Status, Technique
+from warp_reflect.sweep import REFERENCE, Contender
 from warp_reflect.techniques import TECHNIQUES
 from warp_reflect.viewer import cameras
+from warp_reflect.viewer.tradeoff import Tradeoff, mark_of, quick_contenders
 
 COARSE = 4  # a side of a moving picture is this much shorter
 COARSE_MIN = 16  # pixels a side: below it nothing is recognised
@@ -77,16 +80,69 @@ class Control:
         return ZERO_WORDS.get(self.name, "0") if value == 0 and not isinstance(value, str) else f"{value}"
 
 
-CONTROLS = (
-    Control("method", "technique", (*METHODS, *TECHNIQUES)),
-    Control("grid_share", "grid share", (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)),
-    Control("grid_error_px", "grid error (px)", (0.0, 0.1, 0.25, 0.5, 1.0, 2.0, 4.0)),
-    Control("iterations", "iterations", (0, 1, 2, 3, 4, 6, 9, 12, 16, 24)),
-    Control("map_resolution", "map resolution", (8, 16, 32, 64, 128, 256, 512)),
-    Control("reuse_px", "reuse (px)", (0.0, 0.1, 0.25, 0.5, 1.0, 2.0)),
-    Control("refine", "refine", REFINEMENTS),
-)
+# Positions that say more than the generic ones; these knobs come first.
+POSITIONS = {
+    "grid_share": (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0),
+    "grid_error_px": (0.0, 0.1, 0.25, 0.5, 1.0, 2.0, 4.0),
+    "iterations": (0, 1, 2, 3, 4, 6, 9, 12, 16, 24),
+    "map_resolution": (8, 16, 32, 64, 128, 256, 512),
+    "reuse_px": (0.0, 0.1, 0.25, 0.5, 1.0, 2.0),
+    "refine": (),
+    "search": (),
+    "tolerance": (0.0, 1.0e-6, 1.0e-5, 1.0e-4, 1.0e-3, 1.0e-2, 0.1),
+}
+LABELS = {
+    "grid_share": "grid share",
+    "grid_error_px": "grid error (px)",
+    "map_resolution": "map resolution",
+    "reuse_px": "reuse (px)",
+}
 ZERO_WORDS = {"grid_share": "off", "grid_error_px": "off", "iterations": "default", "reuse_px": "off"}
+AT_LOADING = ("complexity", "reflector_max_roughness", "reflector_min_weight")  # nothing of a loaded stage follows them
+FACTORS = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0)  # of a setting's default
+FROM_ZERO = (0, 1, 2, 4, 8, 16, 32, 64)  # of a setting that is 0 by default
+FRACTIONS = (0.05, 0.1, 0.25, 0.5)  # between 0 and 1 of those that take them
+
+
+def controls() -> tuple[Control, ...]:
+    """Every knob: the technique, then all settings that a loaded stage follows."""
+    known = {each.name: each for each in dataclasses.fields(Settings) if each.name not in AT_LOADING}
+    ordered = [known[name] for name in POSITIONS if name in known]
+    ordered += [each for name, each in known.items() if name not in POSITIONS]
+    made = [Control("method", "technique", (*METHODS, *TECHNIQUES))]
+    for each in ordered:
+        values = POSITIONS.get(each.name) or _positions(each.name, each.default)
+        made.append(Control(each.name, LABELS.get(each.name, each.name.replace("_", " ")), values))
+    return tuple(made)
+
+
+def _positions(name: str, default) -> tuple:
+    """Values of a setting that a slider steps through: all words, else the default and what lies about it."""
+    if isinstance(default, bool):
+        return (False, True)
+    if isinstance(default, str):
+        try:
+            Settings().replace(**{name: "?"})
+        except ValueError as refusal:  # it says what is possible
+            _, said, words = str(refusal).partition("expected one of ")
+            return tuple(words.split(", ")) if said else (default,)
+        return (default,)
+    if not isinstance(default, int | float):
+        return (default,)
+    steps = sorted({0, *FRACTIONS, *FROM_ZERO}) if default == 0 else [factor * default for factor in FACTORS]
+    kind = type(default)
+    return tuple(value for value in sorted({kind(step) for step in steps} | {default}) if _possible(name, value))
+
+
+def _possible(name: str, value) -> bool:
+    try:
+        Settings().replace(**{name: value})
+    except ValueError:
+        return False
+    return True
+
+
+CONTROLS = controls()
 
 
 @dataclass(frozen=True)
@@ -146,6 +202,7 @@ class Session:
         comparison: The frame's error against it; None likewise.
         picks: Picked pixels, the last one last.
         message: What the user should read, such as why a value was refused.
+        tradeoff: Accuracy against time: a sweep's points, and those of the settings tried so far in this view.
         pivot: What the camera turns about, world [3].
         frame_ms: Wall time of the frame.
     """
@@ -170,6 +227,8 @@ class Session:
         self.picks: list[Pick] = []
         self.message = ""
         self.frame_ms = 0.0
+        self.tradeoff = Tradeoff()
+        self._swept = False  # its points are of this very view
         self.camera = self._first_camera(camera)
         self._replan()
         self.pivot = cameras.pivot_of(self.plan)
@@ -195,6 +254,7 @@ class Session:
     def use_camera(self, camera: str | Camera) -> None:
         """Look through a camera of the stage, by path or name; a full frame."""
         self.camera, self.picks = find_camera(self.scene, camera, self.size), []
+        self._forget_points()
         self._replan()
         self.pivot = cameras.pivot_of(self.plan)
         self.refine()
@@ -207,6 +267,7 @@ class Session:
         known = next((each for each in before.data.cameras if each.path == self.camera.path), None)
         held = known is not None and np.array_equal(Camera.from_data(known, self.size).eye, self.camera.eye)
         self.scene = scene
+        self._forget_points()
         if held and any(each.path == self.camera.path for each in scene.data.cameras):
             self.camera = find_camera(scene, self.camera.path, self.size)
         self.picks = []
@@ -216,6 +277,7 @@ class Session:
 
     def _move(self, camera: Camera) -> None:
         self.camera = camera
+        self._forget_points()
         small = tuple(max(side // COARSE, min(side, COARSE_MIN)) for side in self.size)
         # A plan renders at its own size. The coarse one shares what the techniques prepared.
         self._render(dataclasses.replace(self.plan, camera=cameras.resized(camera, small)), self.frame)
@@ -239,7 +301,37 @@ class Session:
             traced = make_plan(self.scene, self.camera, self.size, self.settings, "reference")
             self.reference = render_frame(self.scene, traced)
             self.comparison = compare_frames(self.frame, self.reference)
+            if self.comparison.mirror_pixels:
+                self.tradeoff.trail.append(mark_of(self._settings_in_words(), self.frame, self.comparison))
         return self.comparison
+
+    def quick_sweep(self) -> Iterator[str]:
+        """Measure this view with every technique and each of its knobs, one after the other; replaces the plot's sweep.
+
+        Each contender's second frame counts, as its first one prepares.
+
+        Yields:
+            The name of what was measured.
+        """
+        self.measure()
+        self.tradeoff = Tradeoff(
+            [mark_of(REFERENCE, self.reference, compare_frames(self.reference, self.reference))]
+            if self.comparison.mirror_pixels
+            else [],
+            f"measured here at {self.size[0]}x{self.size[1]}, one frame each",
+            self.tradeoff.trail,
+        )
+        self._swept = True
+        for each in quick_contenders(self) if self.comparison.mirror_pixels else ():
+            if each.name != REFERENCE:
+                self._try(each)
+                yield each.name
+
+    def _try(self, contender: Contender) -> None:
+        plan = make_plan(self.scene, self.camera, self.size, contender.settings, contender.method)
+        render_frame(self.scene, plan)
+        frame = render_frame(self.scene, plan)
+        self.tradeoff.marks.append(mark_of(contender.name, frame, compare_frames(frame, self.reference)))
 
     # Knobs.
 
@@ -343,6 +435,20 @@ class Session:
         if camera is None and not self.scene.data.cameras:
             return cameras.default_camera(self.scene, self.size)
         return find_camera(self.scene, camera, self.size)
+
+    def _forget_points(self) -> None:
+        """Errors and times are of one view; a sweep that was read says itself of which."""
+        self.tradeoff.trail.clear()
+        if self._swept:
+            self.tradeoff, self._swept = Tradeoff(), False
+
+    def _settings_in_words(self) -> str:
+        changed = {
+            each.name: getattr(self.settings, each.name)
+            for each in dataclasses.fields(Settings)
+            if getattr(self.settings, each.name) != each.default
+        }
+        return " ".join([self.method, *(f"{name}={value}" for name, value in changed.items())])
 
     def _replan(self) -> None:
         self.plan = make_plan(self.scene, self.camera, self.size, self.settings, self.method, earlier=self.plan)
