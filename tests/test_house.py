@@ -27,7 +27,7 @@ FLOORS = {
     "direct channels stage stage.* scene_field",
     3: "solve solver solve_device solve_plane solve_convex solve_map solve_general solve_qim solver_gradients mirrors "
     "refraction solve_refraction solver_arrays reflector_maps techniques techniques.* finishes finishes.*",
-    4: "planner effects budget bake frame motion virtual_objects seen sweep sweep_report",
+    4: "planner effects budget choice applicable calibration realised bake frame motion virtual_objects seen sweep sweep_report",
     5: "cli viewer viewer.* pipeline process progress cluster farm",
 }
 # Where an imported library may appear, inside functions or out.

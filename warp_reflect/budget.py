@@ -1,72 +1,297 @@
-"""What a technique is predicted to cost on a machine, from what its steps were measured to cost."""
+"""What a technique is predicted to cost and to err, from what its steps were measured to cost on a machine.
+
+The error model: what is refined is exact but for few pixels; of an unrefined picture the straight virtual edges, the texels
+of the map, the steps of the search and the cells of the grid each err by a known law (sources at the constants), and the
+picture by their sum.
+"""
 
 from __future__ import annotations
 
-from warp_reflect.launch import thread_count
-from warp_reflect.scene import PartRange, Scene
+import math
+from dataclasses import dataclass
+
 from warp_reflect.settings import Settings
 
-# Microseconds per element on one CPU thread (a 2026 server core). Ratios between them decide, and those vary less from
-# machine to machine than the figures.
-SEARCH_US = 0.16  # per virtual vertex, between a warm (0.13) and a cold (0.45) start
-RASTER_US = 0.35  # per virtual triangle, the clipping at the hidden boundary included
-REFINE_US = 0.18  # per mirror pixel
-TRACE_US = 0.6  # per mirror pixel at 60,000 triangles; grows with their logarithm, which is left out
-DOUBT_SHARE = 0.05  # of the mirror pixels that refinement leaves to the BVH
-BRANCHES_US = (
-    20.0  # per vertex of the scene, where all its reflection points on a concave side are searched (4 a search)
+
+@dataclass(frozen=True)
+class Costs:
+    """Microseconds per element on one CPU thread; those here were measured on a server core of 2026.
+
+    `calibration.measure` finds them for another machine. Ratios between them decide, and those vary less.
+    """
+
+    trace: float = 0.45
+    """A reflected ray through a BVH of `TRACE_BASE` triangles; grows with their logarithm."""
+    mirrored: float = 0.02
+    """A vertex mirrored in a plane."""
+    quadric_cold: float = 0.5
+    """A vertex solved on a quadric, from nothing, boxes and the rest of a search's step included."""
+    quadric_warm: float = 0.16
+    """The same from the last frame's answer."""
+    map_cold: float = 0.55
+    """A vertex solved in a map, from nothing."""
+    map_warm: float = 0.16
+    """The same from the last frame's answer."""
+    branches: float = 20.0
+    """A vertex whose every reflection point on a concave side is searched."""
+    cut: float = 1.6
+    """A virtual vertex added where edges bend, on a frame that cuts anew."""
+    draw: float = 0.35
+    """A virtual triangle, the clipping at the hidden boundary included."""
+    interpolated: float = 0.05
+    """A vertex interpolated from a grid."""
+    candidate: float = 0.08
+    """A mirror pixel that shows its candidate, unrefined."""
+    refined: float = 0.18
+    """A mirror pixel whose candidate is tested."""
+    own_body: float = 0.25
+    """A pixel of a mirror that may see itself."""
+    looked_up: float = 0.12
+    """A mirror pixel that is looked up in a map of its environment: one bilinear look-up in a cube."""
+    map_texel: float = 0.4
+    """A texel of an environment map that is drawn: its ray, its shading."""
+    map_triangle: float = 0.1
+    """A triangle of the scene, for every face of such a map."""
+    eye_triangle: float = 0.12
+    """A triangle in the eye's own view."""
+    eye_pixel: float = 0.03
+    """A pixel of the picture: drawn, its mirror found, shaded."""
+    mirror_pixel: float = 0.15
+    """A mirror pixel: its point and normal, and the shading of what it shows."""
+    layer: float = 300.0
+    """A reflector: what does not depend on counts."""
+    sharing: float = 0.85
+    """Of a further thread, how much it adds to the first."""
+
+
+BUILT_IN = Costs()
+TRACE_BASE = 65536  # triangles at which `Costs.trace` is told
+COLD_SHARE = 0.1  # of frames that start from nothing: of those of a walk few do, a single picture does
+DOUBT_SHARE = 0.05  # of the mirror pixels that refinement leaves to the BVH, at the finest edges
+DOUBT_UNCUT = 0.3  # the same where edges are not cut
+CUT_ADDED = 1.0  # virtual vertices and triangles added per one of the scene at `EDGE_BASE`; inverse to the bend allowed
+CUT_ADDED_MAX = 2.0  # `virtual_mesh.BUDGET_SHARE`
+EDGE_BASE = 0.25  # pixels
+GRID_NODES = 0.06  # solved per vertex at `GRID_BASE`, by the third power of the cell's edge
+GRID_BASE = 0.5  # pixels
+GRID_NODES_MAX = 0.15  # `grid.NODES_MAX`
+GRID_MIN = 0.02
+REUSED_SHARE = 0.5  # of the vertices kept from frame to frame, at half a pixel and a slow walk
+TEXEL_BYTES = {"reflector_map": 32, "environment": 24}  # position and normal; radiance and coverage, distance, triangle
+
+# Errors, at the 95th percentile of the mirror pixels. Measured on this package's scenes where no other source is given.
+EDGE_ERROR = 0.4  # of the bend that `edge_px` allows: few edges use it up
+EDGE_FLOOR = 0.05  # pixels; corners of virtual triangles are right, what lies between is interpolated
+UNCUT_ERROR = 1.2  # pixels: the papers' picture, straight edges between exact vertices
+# Shares of the mirror pixels that show another thing: silhouettes that lie elsewhere, holes beside triangles cut
+# differently; by `refine`. Those of an uncut mesh are so many that the percentile is no measure of it any more.
+WRONG_SHARE = {"exact": 2.0e-4, "strict": 7.0e-5, "off": 2.0e-2}
+WRONG_UNCUT = {"exact": 3.0e-3, "strict": 1.0e-3, "off": 0.15}
+WRONG_COARSE = 0.02  # added per pixel of `edge_px`, unrefined
+# A wrong pixel counts as so many pixels of error where plans are compared.
+WRONG_PX = 30.0
+# Error of a reflection point over the mirror's half extent, 95 %: bilinear maps err by 0.2 h^2, h the texel.
+MAP_ERROR = 0.2
+# Likewise, after so many steps of a search from nothing (a body of 2:1:1, maps of 256 nodes; Newton counts evaluations).
+NEWTON_ERROR = {1: 1.0e-1, 2: 2.0e-2, 3: 1.2e-3, 4: 1.0e-4, 5: 1.0e-5}
+MIDPOINT_ERROR = {3: 7.0e-2, 5: 2.1e-2, 7: 7.7e-3, 9: 3.3e-3, 14: 5.0e-4}
+DIRECTION_PX = 0.25  # `grid.DIRECTION_PX`: cells of a grid of directions are never judged by more
+GRID_SHARE_PX = (
+    2.0  # error of a grid of a share of 4 %; falls with the share (Estalella et al. 2005, figure 7, as reproduced)
 )
-OWN_BODY_US = 0.25  # per pixel of a mirror that may see itself
-LOOK_UP_US = 0.12  # per mirror pixel: one bilinear look-up in a cube map
-MAP_TEXEL_US = 0.4  # per texel of a map that is drawn: its ray, its shading
-MAP_RASTER_US = 0.1  # per triangle and face of a map that is drawn
-MAP_TEXEL_BYTES = 24  # radiance and coverage, distance, triangle
-CURVED_SHARE = 2.0  # virtual vertices and triangles per one of the scene, where a curved mirror bends edges
 
 
-def predict(
-    scene: Scene,
-    part: PartRange,
-    technique: str,
-    pixels: int,
-    settings: Settings,
-    branches: bool = False,
-    passes: int = 1,
-    held: float = 1.0,
-) -> dict[str, float]:
-    """Predicted `error_px`, `ms` per frame and prepared `bytes` of a reflector.
+@dataclass(frozen=True)
+class Work:
+    """What a frame asks of one reflector by one technique, in counts.
 
-    Args:
-        part: The mirror; its own vertices and triangles have no picture in it.
-        technique: A key of `TECHNIQUES`.
+    Attributes:
         pixels: At which it is seen.
-        settings: The knobs.
-        branches: The mirror is seen from within, and every vertex may appear several times (`quadric` and
-            `reflector_map`).
+        vertices: Of the scene, without the mirror's own.
+        triangles: Likewise.
+        scene_triangles: All of them.
         passes: How often every vertex is reflected: once for every sheet of a mirror.
         held: Share of the mirror that the technique holds; the rest is traced, and the mirror may see itself.
+        branches: It is seen from within, and every vertex may appear several times.
+        size_px: Half extent of the mirror's picture. [pixels]
+        parallax_px: By how much a map of its environment errs. [pixels]
     """
-    threads = thread_count(scene.device, settings.threads)
-    traced = pixels * TRACE_US
-    if technique == "raytraced" or pixels == 0:
-        return {"error_px": 0.0, "ms": 1e-3 * traced / threads, "bytes": 0}
+
+    pixels: int
+    vertices: int = 0
+    triangles: int = 0
+    scene_triangles: int = 2
+    passes: int = 1
+    held: float = 1.0
+    branches: bool = False
+    size_px: float = 0.0
+    parallax_px: float = 0.0
+
+
+def predict(work: Work, technique: str, settings: Settings, costs: Costs = BUILT_IN, threads: int = 1) -> dict:
+    """Predicted cost and error of a reflector.
+
+    Args:
+        work: What is asked.
+        technique: A key of `TECHNIQUES`.
+        settings: The knobs.
+        costs: Of the machine.
+        threads: CPU threads.
+
+    Returns:
+        `ms` of a frame among others, `first_ms` of one that starts from nothing (without preparation), `error_px`: what 95 %
+        of the mirror pixels stay below, `wrong_share`: of the pixels that show another thing, and prepared `bytes`.
+    """
+    if work.pixels == 0:
+        return {"error_px": 0.0, "wrong_share": 0.0, "ms": 0.0, "first_ms": 0.0, "bytes": 0}
+    warm, cold = _microseconds(work, technique, settings, costs)
+    error, wrong = _error(work, technique, settings)
+    speed = speedup(costs, threads)
+    return {
+        "error_px": error,
+        "wrong_share": wrong,
+        "ms": 1e-3 * ((1.0 - COLD_SHARE) * warm + COLD_SHARE * cold) / speed,
+        "first_ms": 1e-3 * cold / speed,
+        "bytes": work.passes * _texels(technique, settings) * TEXEL_BYTES.get(technique, 0),
+    }
+
+
+def fixed_ms(triangles: int, pixels: int, mirror_pixels: int, costs: Costs = BUILT_IN, threads: int = 1) -> float:
+    """Predicted milliseconds of what no choice changes: the eye's view and the shading.
+
+    Args:
+        triangles: Of the scene.
+        pixels: Of the picture.
+        mirror_pixels: Of them, those that show a mirror.
+        costs: Of the machine.
+        threads: CPU threads.
+    """
+    spent = triangles * costs.eye_triangle + pixels * costs.eye_pixel + mirror_pixels * costs.mirror_pixel
+    return 1e-3 * spent / speedup(costs, threads)
+
+
+def speedup(costs: Costs, threads: int) -> float:
+    """How much faster several threads are than one."""
+    return 1.0 + costs.sharing * (threads - 1)
+
+
+def loss(predicted: dict) -> float:
+    """One number to compare plans by: the error in pixels, wrong pixels included."""
+    return predicted["error_px"] + WRONG_PX * predicted["wrong_share"]
+
+
+def map_blur_px(pixels: int, resolution: int) -> float:
+    """By how much the texels of an environment map blur what a curved mirror shows: half a texel, in pixels.
+
+    A closed convex mirror shows every direction, 4 pi, over its pixels.
+    """
+    return 0.5 * (0.5 * math.pi / resolution) / math.sqrt(4.0 * math.pi / max(pixels, 1))
+
+
+def _texels(technique: str, settings: Settings) -> int:
+    resolution = {"reflector_map": settings.map_resolution, "environment": settings.environment_resolution}
+    return 6 * resolution.get(technique, 0) ** 2
+
+
+def _microseconds(work: Work, technique: str, settings: Settings, costs: Costs) -> tuple[float, float]:
+    """(of a frame that follows another, of one that starts from nothing) on one thread."""
+    ray = costs.trace * math.log2(max(work.scene_triangles, 2)) / math.log2(TRACE_BASE)
+    if technique == "raytraced":
+        return (costs.layer + work.pixels * ray,) * 2
     if technique == "environment":
-        texels = 6 * settings.environment_resolution**2
-        drawn = texels * MAP_TEXEL_US + 6 * scene.triangle_count * MAP_RASTER_US
-        work = pixels * LOOK_UP_US + (0.0 if settings.environment_update == "static" else drawn)
-        return {"error_px": 0.0, "ms": 1e-3 * work / threads, "bytes": texels * MAP_TEXEL_BYTES}
-    vertices = scene.vertex_count - (part.vertex_count if part.is_whole else 0)
-    forward = vertices * SEARCH_US + (scene.triangle_count - part.triangle_count) * RASTER_US
-    if technique != "planar":
-        forward *= CURVED_SHARE
-    forward *= passes
-    if held < 1.0 or passes > 1:
-        forward += pixels * ((1.0 - held) * TRACE_US + OWN_BODY_US)
-    if branches:
-        forward += vertices * BRANCHES_US + pixels * OWN_BODY_US
+        drawn = _texels(technique, settings) * costs.map_texel + 6 * work.scene_triangles * costs.map_triangle
+        drawn = 0.0 if settings.environment_update == "static" else drawn
+        return (costs.layer + work.pixels * costs.looked_up + drawn,) * 2
+    added = 0.0 if technique == "planar" else _added_share(settings)
+    cold, warm = _search(work.vertices, technique, settings, costs)
+    every = costs.layer + work.triangles * (1.0 + added) * costs.draw
+    every += work.pixels * (costs.candidate if settings.refine == "off" else _refined(settings, ray, costs))
+    cut = work.vertices * added * costs.cut
+    warm = work.passes * (every + warm * (1.0 + added))
+    cold = work.passes * (every + cold + cut)
+    rest = 0.0
+    if work.held < 1.0 or work.passes > 1:
+        rest += work.pixels * ((1.0 - work.held) * ray + costs.own_body)
+    if work.branches:
+        rest += work.vertices * costs.branches + work.pixels * costs.own_body
+    return warm + rest, cold + rest
+
+
+def _added_share(settings: Settings) -> float:
+    """Virtual vertices and triangles added to one of the scene, where a curved mirror bends edges."""
+    return min(CUT_ADDED * EDGE_BASE / settings.edge_px, CUT_ADDED_MAX) if settings.edge_px > 0.0 else 0.0
+
+
+def _search(vertices: int, technique: str, settings: Settings, costs: Costs) -> tuple[float, float]:
+    """(from nothing, from the last frame) for the scene's vertices."""
+    if technique == "planar":
+        return (vertices * costs.mirrored,) * 2
+    cold, warm = (costs.quadric_cold, costs.quadric_warm)
+    if technique != "quadric":
+        cold, warm = costs.map_cold, costs.map_warm
+    if technique == "reflector_map" and (settings.grid_error_px > 0.0 or settings.grid_share > 0.0):
+        nodes = settings.grid_share
+        if settings.grid_error_px > 0.0:
+            nodes = GRID_NODES * (GRID_BASE / settings.grid_error_px) ** (2.0 / 3.0)
+        nodes = min(max(nodes, GRID_MIN), max(GRID_NODES_MAX, settings.grid_share))
+        cold, warm = nodes * cold + costs.interpolated, nodes * warm + costs.interpolated
+    if settings.reuse_px > 0.0 and technique in ("quadric", "reflector_map"):
+        warm *= 1.0 - REUSED_SHARE
+    return vertices * cold, vertices * warm
+
+
+def _refined(settings: Settings, ray: float, costs: Costs) -> float:
+    doubt = DOUBT_SHARE if settings.edge_px > 0.0 else DOUBT_UNCUT
+    return costs.refined * (1.25 if settings.refine == "strict" else 1.0) + doubt * ray
+
+
+def _error(work: Work, technique: str, settings: Settings) -> tuple[float, float]:
+    """(95th percentile in pixels, share of wrong pixels)."""
+    if technique == "raytraced":
+        return 0.0, 0.0
+    if technique == "environment":
+        return work.parallax_px + map_blur_px(work.pixels, settings.environment_resolution), 0.0
+    curved = technique != "planar"
+    uncut = curved and settings.edge_px == 0.0
+    wrong = (WRONG_UNCUT if uncut else WRONG_SHARE)[settings.refine]
     if settings.refine != "off":
-        forward += pixels * (REFINE_US + DOUBT_SHARE * TRACE_US)
-    bytes_ = passes * 6 * settings.map_resolution**2 * 32 if technique == "reflector_map" else 0
-    # Straight virtual edges between exact vertices: the papers' picture is wrong by about a pixel at silhouettes.
-    error = 0.0 if settings.refine != "off" else 1.0
-    return {"error_px": error, "ms": 1e-3 * forward / threads, "bytes": bytes_}
+        return 0.0, wrong
+    error = UNCUT_ERROR if uncut else EDGE_FLOOR + (EDGE_ERROR * settings.edge_px if curved else 0.0)
+    wrong += 0.0 if uncut or not curved else WRONG_COARSE * settings.edge_px
+    if technique in ("reflector_map", "explosion_map"):
+        texel = 2.0 / (settings.map_resolution - 1)
+        error += work.size_px * MAP_ERROR * texel * texel
+    if technique == "reflector_map":
+        error += work.size_px * _search_error(settings) + _grid_error(settings)
+    if technique in ("reflector_map", "quadric"):
+        error += settings.reuse_px
+    return error, wrong
+
+
+def _search_error(settings: Settings) -> float:
+    """Of a reflection point over the mirror's half extent, 95 %."""
+    if settings.search == "newton":
+        return 0.0 if settings.iterations == 0 else _between(NEWTON_ERROR, settings.iterations)
+    return _between(MIDPOINT_ERROR, settings.iterations or 9)
+
+
+def _between(table: dict[int, float], steps: int) -> float:
+    """The table at a number of steps, by the geometric law between its entries; its last beyond them."""
+    below = [key for key in table if key <= steps]
+    above = [key for key in table if key >= steps]
+    if not below or not above:
+        return table[max(table) if below else min(table)]
+    low, high = max(below), min(above)
+    share = 0.0 if low == high else (steps - low) / (high - low)
+    return table[low] ** (1.0 - share) * table[high] ** share
+
+
+def _grid_error(settings: Settings) -> float:
+    if settings.grid_error_px > 0.0:
+        return (
+            min(settings.grid_error_px, DIRECTION_PX) if settings.grid_kind == "direction" else settings.grid_error_px
+        )
+    if settings.grid_share <= 0.0:
+        return 0.0
+    share = GRID_SHARE_PX * 0.04 / settings.grid_share
+    return min(share, DIRECTION_PX) if settings.grid_kind == "direction" else share

@@ -61,11 +61,15 @@ class PlanOptions:
     res: str | None = None
     """Exact size instead, WIDTHxHEIGHT."""
     method: str = "auto"
-    """auto, reference (every mirror ray traced) or a technique."""
+    """auto, reference (every mirror ray traced), none (no mirror reflects) or a technique."""
     reflector: Annotated[list[str] | None, Parameter(negative=())] = None
     """Make mirrors of the prims, materials or collection that this path, name or pattern (* and ?) names; repeatable.
     They become neutral metal; end it in :color=keep (or one number or three), :roughness=R, :metallic=M or :technique=T
     for another, as in '/World/Car*:color=keep:roughness=0.1'."""
+    max_error_px: float | None = None
+    """Take what is cheapest among all that shows 95 % of the mirror pixels within this, and say what it came out as."""
+    budget_ms: float | None = None
+    """Take what is most accurate among all that makes a frame in this time, and say what it came out as."""
     set_: Annotated[list[str] | None, Parameter(name="--set", negative=())] = None
     """A setting, name=value; repeatable."""
     complexity: Annotated[str | None, Parameter(name=["--complexity", "-c"])] = None
@@ -637,8 +641,9 @@ def _settings(planned: PlanOptions):
         if not equals:
             raise ValueError(f"--set: got '{item}', expected name=value with a name of {', '.join(Settings.names())}")
         changes[name.strip()] = value.strip()
-    if planned.complexity is not None:
-        changes["complexity"] = planned.complexity
+    for name in ("complexity", "max_error_px", "budget_ms"):
+        if getattr(planned, name) is not None:
+            changes[name] = getattr(planned, name)
     return Settings().replace(**changes)
 
 

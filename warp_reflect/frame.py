@@ -14,7 +14,7 @@ from warp_reflect import __version__, images, motion, raster, shade, surface
 from warp_reflect.channels import CHANNELS, POINTS, component_of, known_names, reflection_channels
 from warp_reflect.effects import FINISHES
 from warp_reflect.layers import Camera, GBuffer, MirrorPixels, ReflectionLayer, add_statistics
-from warp_reflect.planner import Plan, PlanRow, find_camera
+from warp_reflect.planner import Plan, PlanRow, find_camera, keep_pace
 from warp_reflect.scene import Scene
 from warp_reflect.settings import Technique
 from warp_reflect.techniques import MAPS, TECHNIQUES
@@ -57,6 +57,16 @@ class Frame:
         self.statistics: dict = {}
         for layer in layers.values():
             add_statistics(self.statistics, layer.statistics)
+
+    @property
+    def spent_ms(self) -> float:
+        """Milliseconds of the frame's steps, without preparation."""
+        return sum(ms for step, ms in self.timings.items() if "/" not in step and step != "prepare")
+
+    @property
+    def expected_ms(self) -> float:
+        """What the plan predicted for them."""
+        return self.plan.predicted["first_ms" if self._before is None else "ms"]
 
     @property
     def prims(self) -> dict[int, str]:
@@ -217,6 +227,8 @@ def render_frame(scene: Scene, plan: Plan, camera: str | Camera | None = None, p
     """
     timer = StageTimer(scene.device)
     plan = plan.at(scene)
+    if previous is not None and not previous.kept:
+        plan = keep_pace(plan, previous.plan, previous.spent_ms, previous.expected_ms)
     settings = plan.settings
     view = plan.camera if camera is None else find_camera(scene, camera, plan.size)
     gbuffer, layers = reflect_scene(scene, plan, view, timer, previous)

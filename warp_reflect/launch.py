@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache, partial
+from time import perf_counter
 
 import warp as wp
 
@@ -34,6 +35,13 @@ FINITE_FLAGS = (
 
 
 _recordings: list[list[tuple[str, int]]] = []
+_loaded: set[tuple] = set()
+_loading = [0.0]
+
+
+def loading_ms() -> float:
+    """Milliseconds that this process has spent on loading and compiling kernels, since it began."""
+    return 1000.0 * _loading[0]
 
 
 @contextmanager
@@ -93,11 +101,11 @@ def launch(kernel, count: int, inputs: list, device, threads: int = 0, split_min
     if count <= 0:
         return
     _record(kernel, count)
+    _load(kernel, device)
     step = slice_length(count, device, threads, split_min)
     if step >= count:
         wp.launch(kernel, dim=count, inputs=[0, *inputs], device=device)
         return
-    _load(kernel, device)
     run_parallel(
         [
             partial(wp.launch, kernel, dim=min(step, count - first), inputs=[first, *inputs], device=device)
@@ -125,8 +133,13 @@ def _load(kernel, device) -> None:
     # The module must be compiled and loaded before threads race for it. With the block size of a CPU launch: it is
     # part of the module's identity, and another one would compile everything a second time.
     device = wp.get_device(device)
-    if device.is_cpu:
-        kernel.module.load(device, CPU_BLOCK_DIM)
+    key = kernel.module, str(device)
+    if key in _loaded or not device.is_cpu:
+        return
+    start = perf_counter()
+    kernel.module.load(device, CPU_BLOCK_DIM)
+    _loading[0] += perf_counter() - start
+    _loaded.add(key)
 
 
 def run_parallel(jobs: list) -> None:

@@ -30,6 +30,7 @@ import numpy as np
 import warp_reflect as wr
 from warp_reflect import images, seen
 from warp_reflect.progress import Report, statistics_line
+from warp_reflect.realised import realised_error
 
 KEY = "warp_reflect:key"  # header entry: what the frame was made from, see `frame_key`
 DONE, PART_WAY, IMPOSSIBLE = 0, 1, 2
@@ -379,8 +380,18 @@ def _render(opened: OpenJob, place: int, digest: str) -> Outcome:
             seen.write_boxes(name, seen.coco_boxes(frame, number, relative, attributes))
     width, height = frame.camera.size
     notes = tuple((note.path, note.text) for note in [*frame.scene.notes, *frame.plan.notes])
-    text = f"{width}x{height}, {rendered_ms:.0f} ms{statistics_line(frame.statistics)}"
+    text = f"{width}x{height}, {rendered_ms:.0f} ms{statistics_line(frame.statistics)}{_came_out(frame)}"
     return Outcome(place, "written", text, ms=rendered_ms, notes=notes)
+
+
+def _came_out(frame: wr.Frame) -> str:
+    """What a request for an error or a time came out as; empty without one."""
+    settings = frame.plan.settings
+    if settings.max_error_px <= 0.0 and settings.budget_ms <= 0.0:
+        return ""
+    predicted = frame.plan.predicted
+    told = f"; predicted {frame.expected_ms:.3g} ms, {predicted['error_px']:.2g} px"
+    return f"{told}; realised {frame.spent_ms:.3g} ms, {realised_error(frame)}"
 
 
 def part_of(count: int, part: tuple[int, int]) -> range:

@@ -8,19 +8,25 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from warp_reflect import __version__, budget, raster
+from warp_reflect import __version__, applicable, choice, raster
+from warp_reflect.applicable import PREFERRED
+from warp_reflect.budget import BUILT_IN, Costs, fixed_ms, predict
 from warp_reflect.effects import Effect, finish_effects
+from warp_reflect.launch import thread_count
 from warp_reflect.layers import Camera, Reflector
 from warp_reflect.reflectors import mirror_weight
 from warp_reflect.scene import Note, PartRange, Scene
 from warp_reflect.settings import Settings
 from warp_reflect.techniques import MAPS, TECHNIQUES
 
-PREFERRED = ("planar", "quadric", "reflector_map")  # the exact and cheap first
-JUDGED_IN_PIXELS = ("planar", "quadric")  # whether they apply depends on the view
-METHODS = ("auto", "reference")
+METHODS = ("auto", "reference", "none")
 REUSING = ("quadric", "reflector_map")  # know a bound on how far a virtual vertex drifts
 DEFAULT_SIZE = (960, 540)  # usdrecord's default width at 16:9
+# Of the time asked for: between them a frame's time changes nothing.
+BAND = (0.7, 1.05)
+ROOM = 0.95  # of it: what a dearer choice may be predicted to take
+PACE_STEP = 2.0  # by which a pace changes at most from one frame to the next: one frame may have been disturbed
+PACE_WEIGHT = 0.7  # of the last frame in the pace, as an exponent
 
 
 @dataclass(frozen=True)
@@ -52,6 +58,8 @@ class Plan:
     Attributes:
         rows: One `PlanRow` per reflector, in the order of their ids.
         notes: What the user should know about the plan, beside the scene's own notes.
+        costs: What the machine's steps cost.
+        pace: Milliseconds that took place for one that was predicted, learnt where a time is asked for.
     """
 
     scene: Scene
@@ -60,7 +68,28 @@ class Plan:
     method: str
     rows: list[PlanRow]
     notes: list[Note]
+    costs: Costs = BUILT_IN
+    pace: float = 1.0
     _prepared: dict[int, object] = field(default_factory=dict)
+    _fronts: dict[int, list[choice.Option]] = field(default_factory=dict)
+
+    @property
+    def fixed_ms(self) -> float:
+        """Predicted milliseconds of a frame whatever is chosen: the eye's view and the shading."""
+        width, height = self.size
+        seen = sum(row.pixels for row in self.rows)
+        threads = thread_count(self.scene.device, self.settings.threads)
+        return fixed_ms(self.scene.triangle_count, width * height, seen, self.costs, threads)
+
+    @property
+    def predicted(self) -> dict[str, float]:
+        """Of a whole frame, without preparation: `ms` among others, `first_ms` from nothing, `error_px` of its worst mirror."""
+        numbers = [row.predicted for row in self.rows]
+        return {
+            "ms": self.pace * (self.fixed_ms + sum(each["ms"] for each in numbers)),
+            "first_ms": self.pace * (self.fixed_ms + sum(each["first_ms"] for each in numbers)),
+            "error_px": max((each["error_px"] for each in numbers), default=0.0),
+        }
 
     @property
     def size(self) -> tuple[int, int]:
@@ -80,7 +109,7 @@ class Plan:
             return self
         moving = any(camera.path == self.camera.path for camera in scene.data.cameras)
         camera = self.camera.path if moving else self.camera
-        return make_plan(scene, camera, self.size, self.settings, self.method, earlier=self)
+        return make_plan(scene, camera, self.size, self.settings, self.method, earlier=self, costs=self.costs)
 
     def to_json(self) -> dict:
         """The plan as `warp-reflect plan --json` prints it."""
@@ -91,6 +120,7 @@ class Plan:
             "size": list(self.camera.size),
             "time": self.scene.data.time,
             "method": self.method,
+            "predicted": self.predicted,
             "reflectors": [
                 {
                     "id": row.reflector.id,
@@ -129,7 +159,41 @@ class Plan:
             lines.append(f"{row.reflector.id:3d} {name:{column}}  {chosen:{technique}}  {row.pixels:9,d}  {numbers}")
             lines.append(f"    {row.reason}")
             lines += [f"    {'on ' if each.on else 'off'} {name}: {each.reason}" for name, each in row.effects.items()]
+        whole = self.predicted
+        times = f"{whole['ms']:.3g} ms, {whole['first_ms']:.3g} ms from nothing"
+        lines.append(f"a frame: {times}, {whole['error_px']:.2g} px (predicted)")
         return "\n".join(lines)
+
+
+def keep_pace(plan: Plan, before: Plan, spent_ms: float, expected_ms: float) -> Plan:
+    """The plan of the next frame of an animation, for a request for a time, from how long the last frame took.
+
+    Within a dead band about the time asked for the last choice stands, so that quality does not flicker; outside of it the
+    pace is learnt and the choice is made again. What is dearer is taken only where it leaves some room.
+
+    Args:
+        plan: Of the next frame.
+        before: Of the last one.
+        spent_ms: It took, without preparation.
+        expected_ms: Was predicted for it, at its pace.
+    """
+    budget = plan.settings.budget_ms
+    if budget <= 0.0 or expected_ms <= 0.0 or (before.settings, before.method) != (plan.settings, plan.method):
+        return plan
+    within = BAND[0] * budget <= spent_ms <= BAND[1] * budget
+    ratio = min(max(spent_ms / expected_ms, 1.0 / PACE_STEP), PACE_STEP)
+    if within:
+        if before.scene is plan.scene and before.camera is plan.camera:
+            return before
+        made = dataclasses.replace(plan, rows=list(plan.rows), notes=[], _prepared=dict(plan._prepared))
+        _fit(made, before.pace, keep=before)
+    else:
+        made = dataclasses.replace(plan, rows=list(plan.rows), notes=[], _prepared=dict(plan._prepared))
+        _fit(made, before.pace * ratio**PACE_WEIGHT)
+        if made.predicted["ms"] > ROOM * budget and spent_ms < budget:
+            _fit(made, made.pace, keep=before)
+    _take_over(made, before)
+    return made
 
 
 def make_plan(
@@ -139,6 +203,7 @@ def make_plan(
     settings: Settings | None = None,
     method: str = "auto",
     earlier: Plan | None = None,
+    costs: Costs | None = None,
 ) -> Plan:
     """Decide what is simulated for every reflector of a scene.
 
@@ -147,26 +212,30 @@ def make_plan(
         camera: Prim path or name of a camera in the stage, or a `Camera`; None: the stage's first.
         size: (width, height). [pixels]
         settings: The knobs; None: the defaults.
-        method: `auto`, `reference` (every mirror traced) or a key of `TECHNIQUES`; where it does not apply the mirror
-            is traced, with a note.
+        method: `auto`, `reference` (every mirror traced), `none` (no mirror reflects) or a key of `TECHNIQUES`; where it
+            does not apply the mirror is traced, with a note.
         earlier: The plan of another time of the stage; what its techniques prepared is taken over where the world is
-            the same (`Scene.shares_world`). It decides nothing.
+            the same (`Scene.shares_world`). It decides nothing but what a request for a time has learnt (`Plan.pace`).
+        costs: What the machine's steps cost, see `calibration.known`; None: `budget.BUILT_IN`.
 
     Raises:
         ValueError: an unknown method, an impossible size, or no such camera.
     """
-    settings = settings or Settings()
+    settings, costs = settings or Settings(), costs or BUILT_IN
     if method not in METHODS and method not in TECHNIQUES:
         near = difflib.get_close_matches(method, [*METHODS, *TECHNIQUES], n=3, cutoff=0.3)
         raise ValueError(f"unknown method '{method}'; nearest: {', '.join(near or [*METHODS, *TECHNIQUES])}")
     view = find_camera(scene, camera, size)
     notes: list[Note] = []
+    asked = method != "none"
     found = [
-        (k, part, weight) for k, part in enumerate(scene.parts) if (weight := mirror_weight(scene, part, settings))
+        (k, part, weight)
+        for k, part in enumerate(scene.parts)
+        if asked and (weight := mirror_weight(scene, part, settings))
     ]
     pixels = _pixel_counts(scene, view, [k for k, _, _ in found], settings)
     rows = [
-        _row(scene, view, settings, method, number, part_index, part, weight, pixels[part_index], notes)
+        _row(scene, view, settings, method, number, part_index, part, weight, pixels[part_index], notes, costs)
         for number, (part_index, part, weight) in enumerate(found, 1)
     ]
     bumpy = [scene.data.materials[part.material] for _, part, _ in found]
@@ -174,7 +243,8 @@ def make_plan(
         notes.append(
             Note(path, "texture of normal: a mirror reflects at the surface itself; its normal map is not used")
         )
-    made = Plan(scene, view, settings, method, rows, notes)
+    made = Plan(scene, view, settings, method, rows, notes, costs)
+    _fit(made, 1.0 if earlier is None else earlier.pace)
     _take_over(made, earlier)
     return made
 
@@ -189,13 +259,11 @@ def prefer_forward(plan: Plan, earlier: Plan | None = None) -> Plan:
     scene, camera = plan.scene, plan.camera
     rows = []
     for row in plan.rows:
-        held = [(name, *_applies(scene, row.reflector, camera, name, row.settings)) for name in PREFERRED]
+        held = [(name, *applicable.applies(scene, row.reflector, camera, name, row.settings)) for name in PREFERRED]
         chosen = next(((name, reason) for name, applies, reason in held if applies), None)
         if row.technique == "raytraced" and not row.forced and plan.method == "auto" and chosen is not None:
             name, reason = chosen
-            part = scene.parts[row.reflector.part]
-            work = _work(scene, row.reflector, camera, name)
-            predicted = budget.predict(scene, part, name, row.pixels, row.settings, *work)
+            predicted = _predicted(scene, row.reflector, camera, name, row.pixels, row.settings, plan.costs)
             reason = f"{reason}; for its virtual objects"
             row = dataclasses.replace(row, technique=name, reason=reason, predicted=predicted)
         rows.append(row)
@@ -236,9 +304,6 @@ def find_camera(scene: Scene, camera: str | Camera | None, size: tuple[int, int]
     return Camera.from_data((exact or matching)[0], (width, height))
 
 
-# Triangles. Finding out what a larger mesh is (a quadric, convex sheets) takes seconds: `auto` leaves it where the outcome
-# is several sheets at best, or would lose against tracing even if it were one.
-ANALYSED_MAX = 20000
 PREVIEW_SIDE = 320  # pixels; enough to count a mirror's pixels within a few per cent for the choice of technique
 
 
@@ -262,15 +327,12 @@ def _pixel_counts(scene: Scene, camera: Camera, parts: list[int], settings: Sett
     return {k: round(float(patches[list(scene.parts[k].patches)].sum()) * scale) for k in parts}
 
 
-def _row(scene, camera, settings, method, number, part_index, part, weight, pixels, notes) -> PlanRow:
+def _row(scene, camera, settings, method, number, part_index, part, weight, pixels, notes, costs) -> PlanRow:
     looked_at = method != "auto" or pixels >= max(settings.few_pixels, 1)
     reflector = Reflector(number, part_index, looked_at and scene.body(part_index).convex)
-    technique, forced, reason = _technique(scene, reflector, camera, method, pixels, settings, part, notes)
+    technique, forced, reason = _technique(scene, reflector, camera, method, pixels, settings, part, notes, costs)
     if method == "reference":
         settings = settings.replace(refine="off")
-    predicted = budget.predict(scene, part, technique, pixels, settings, *_work(scene, reflector, camera, technique))
-    if technique == "environment" and pixels:
-        predicted["error_px"] = TECHNIQUES[technique].parallax_px(scene, reflector, camera, settings.threads)
     return PlanRow(
         reflector,
         part.prim_path,
@@ -282,11 +344,16 @@ def _row(scene, camera, settings, method, number, part_index, part, weight, pixe
         pixels,
         _effects(scene, part, technique, pixels, weight, settings),
         settings,
-        predicted,
+        _predicted(scene, reflector, camera, technique, pixels, settings, costs),
     )
 
 
-def _technique(scene, reflector, camera, method, pixels, settings, part, notes) -> tuple[str, bool, str]:
+def _predicted(scene, reflector, camera, technique, pixels, settings, costs) -> dict:
+    work = applicable.work_of(scene, reflector, camera, technique, pixels, settings)
+    return predict(work, technique, settings, costs, thread_count(scene.device, settings.threads))
+
+
+def _technique(scene, reflector, camera, method, pixels, settings, part, notes, costs) -> tuple[str, bool, str]:
     """(technique, forced, reason) of a reflector."""
     if method == "reference":
         return "raytraced", True, "the reference: every mirror is traced"
@@ -298,7 +365,7 @@ def _technique(scene, reflector, camera, method, pixels, settings, part, notes) 
             known = ", ".join(TECHNIQUES)
             notes.append(Note(part.prim_path, f"technique: got '{mirror.technique}', expected auto or one of {known}"))
     if method != "auto":
-        applies, reason = _applies(scene, reflector, camera, method, settings)
+        applies, reason = applicable.applies(scene, reflector, camera, method, settings)
         if applies:
             return method, True, f"asked for; {reason}"
         notes.append(Note(part.prim_path, f"{method} does not apply ({reason}); traced"))
@@ -308,46 +375,90 @@ def _technique(scene, reflector, camera, method, pixels, settings, part, notes) 
     if pixels < settings.few_pixels:
         why = f"{pixels} pixels, fewer than few_pixels={settings.few_pixels}: rays are cheapest, its shape is not looked at"
         return "raytraced", False, why
-    reasons = []
-    traced = budget.predict(scene, part, "raytraced", pixels, settings)["ms"]
-    for name in PREFERRED:
-        least = budget.predict(scene, part, name, pixels, settings)["ms"]
-        if name != "planar" and part.triangle_count > ANALYSED_MAX and (traced < least or not reflector.convex):
-            reasons.append(
-                f"{part.triangle_count} triangles that are not convex together, or dearer to reflect than to trace, are "
-                f"not analysed by auto (at most {ANALYSED_MAX})"
+    return _cheapest(scene, reflector, camera, pixels, settings, costs)
+
+
+def _cheapest(scene, reflector, camera, pixels, settings, costs) -> tuple[str, bool, str]:
+    """(technique, False, reason): the first exact one that applies, unless rays or a map of what is far are cheaper."""
+    threads = thread_count(scene.device, settings.threads)
+    found, refused = applicable.exact_candidates(scene, reflector, camera, pixels, settings, costs)
+    rays = _predicted(scene, reflector, camera, "raytraced", pixels, settings, costs)["ms"]
+    name, reason, least = "raytraced", "; ".join(refused), rays
+    if found:
+        name, reason = found[0].technique, found[0].reason
+        least = predict(found[0].work, name, settings, costs, threads)["ms"]
+        if rays < least:
+            reason = (
+                f"{reason}, but {pixels} pixels are traced in {rays:.1f} ms and {scene.vertex_count} vertices reflected "
+                f"in {least:.1f} ms (predicted)"
             )
-            break
-        applies, reason = _applies(scene, reflector, camera, name, settings)
-        if not applies:
-            reasons.append(f"{name}: {reason}")
+            name, least = "raytraced", rays
+    far = applicable.far_environment(scene, reflector, camera, pixels, settings, settings.environment_px)
+    if far is not None and predict(far.work, far.technique, settings, costs, threads)["ms"] < least:
+        return far.technique, False, f"{far.reason} (at most environment_px={settings.environment_px:g})"
+    return name, False, reason
+
+
+def _fit(made: Plan, pace: float, keep: Plan | None = None) -> None:
+    """Choose techniques and settings anew where the user asks for an error or a time.
+
+    Args:
+        made: Changed in place.
+        pace: Milliseconds that take place for one that is predicted.
+        keep: A plan of the same request whose choice stands, where it is one of this plan's.
+    """
+    settings, scene = made.settings, made.scene
+    if made.method == "reference" or not (settings.max_error_px > 0.0 or settings.budget_ms > 0.0):
+        return
+    rows = {row.reflector.id: row for row in made.rows if row.pixels >= max(settings.few_pixels, 1)}
+    if not made._fronts:
+        made._fronts = {id: choice.frontier(_options(made, row)) for id, row in rows.items()}
+    tiny = sum(row.predicted["ms"] for row in made.rows if row.reflector.id not in rows)
+    chosen = choice.choose(
+        made._fronts,
+        {id: row.pixels for id, row in rows.items()},
+        made.fixed_ms + tiny,
+        settings.max_error_px,
+        settings.budget_ms,
+        pace,
+    )
+    if keep is not None:
+        before = {row.reflector.id: (row.technique, row.settings) for row in keep.rows}
+        for id, front in made._fronts.items():
+            same = next((each for each in front if (each.technique, each.settings) == before.get(id)), None)
+            chosen.options[id] = same or chosen.options[id]
+    for k, row in enumerate(made.rows):
+        option = chosen.options.get(row.reflector.id)
+        if option is None:
             continue
-        forward = budget.predict(scene, part, name, pixels, settings, *_work(scene, reflector, camera, name))["ms"]
-        if traced < forward:
-            return (
-                "raytraced",
-                False,
-                f"{reason}, but {pixels} pixels are traced in {traced:.1f} ms and "
-                f"{scene.vertex_count} vertices reflected in {forward:.1f} ms (predicted)",
-            )
-        return name, False, reason
-    return "raytraced", False, "; ".join(reasons)
+        weight = row.effects["reflection"].numbers["weight"]
+        part = scene.parts[row.reflector.part]
+        reason = chosen.reasons[row.reflector.id]
+        effects = _effects(scene, part, option.technique, row.pixels, weight, option.settings)
+        made.rows[k] = dataclasses.replace(
+            row,
+            technique=option.technique,
+            reason=reason,
+            settings=option.settings,
+            predicted=option.predicted,
+            effects=effects,
+        )
+    made.notes += [Note(scene.data.source, text) for text in chosen.notes]
+    made.pace = pace
 
 
-def _work(scene, reflector, camera: Camera, technique: str) -> tuple[bool, int, float]:
-    """`budget.predict`'s branches, passes and held."""
-    module = TECHNIQUES[technique]
-    branches = technique in ("quadric", "reflector_map") and module.has_branches(scene, reflector, camera)
-    passes, held = module.extent(scene, reflector) if technique in ("quadric", "reflector_map") else (1, 1.0)
-    return branches, passes, held
-
-
-def _applies(scene, reflector, camera: Camera, method: str, settings: Settings) -> tuple[bool, str]:
-    if camera.orthographic and method not in ("raytraced", *MAPS):
-        return False, "orthographic camera: there is no eye to reflect from"
-    if method in JUDGED_IN_PIXELS:
-        return TECHNIQUES[method].applies(scene, reflector, camera, settings.shape_px)
-    return TECHNIQUES[method].applies(scene, reflector)
+def _options(made: Plan, row: PlanRow) -> list[choice.Option]:
+    """Every way to reflect a mirror that a plan may take for a request."""
+    scene, camera, settings = made.scene, made.camera, made.settings
+    ask = (scene, row.reflector, camera, row.pixels, settings)
+    work = {row.technique: applicable.work_of(scene, row.reflector, camera, row.technique, row.pixels, settings)}
+    if not row.forced:
+        found, _ = applicable.exact_candidates(*ask, made.costs)
+        work |= {each.technique: each.work for each in found}
+        work["raytraced"] = applicable.work_of(scene, row.reflector, camera, "raytraced", row.pixels, settings)
+        far = applicable.far_environment(*ask, settings.max_error_px or float("inf"))
+        work |= {far.technique: far.work} if far is not None else {}
+    return choice.options_of(work, settings, made.costs, thread_count(scene.device, settings.threads))
 
 
 def _collection(scene: Scene, part: PartRange) -> Effect:

@@ -82,6 +82,14 @@ class Settings:
     """The grid holds: `direction` (one exact step a vertex), `slope` (positions, derivatives), `position` (the paper's)."""
     grid_error_px: float = 0.0
     """Vertices are interpolated over cells of any size while their estimated error stays below this; 0: off. [pixels]"""
+    max_error_px: float = 0.0
+    """The plan takes what is cheapest among all that is predicted to show 95 % of the mirror pixels within this; 0: what is
+    exact and cheap. [pixels]"""
+    budget_ms: float = 0.0
+    """The plan takes what is most accurate among all that is predicted to make a frame in this time, without preparation;
+    0: what is exact and cheap. Where `max_error_px` contradicts, this gives way. [ms]"""
+    environment_px: float = 0.5
+    """An environment map replaces what is exact where it is cheaper and off by at most this; 0: never. [pixels]"""
     shape_px: float = 0.5
     """A mesh counts as a plane or a quadric where that shifts what it shows by at most this. [pixels]"""
     few_pixels: int = 16
@@ -132,6 +140,9 @@ class Settings:
         _require(
             0.0 <= self.grid_error_px <= 1.0e6, "grid_error_px", self.grid_error_px, "0 (off) or a number of pixels"
         )
+        _require(0.0 <= self.max_error_px <= 1.0e6, "max_error_px", self.max_error_px, "0 (off) or a number of pixels")
+        _require(0.0 <= self.budget_ms <= 1.0e6, "budget_ms", self.budget_ms, "0 (off) or a number of milliseconds")
+        _require(0.0 <= self.environment_px <= 1.0e6, "environment_px", self.environment_px, "0 (never) or pixels")
         _require(0.0 <= self.shape_px <= 1.0e6, "shape_px", self.shape_px, "0 to 1000000 pixels")
         _require(0 <= self.few_pixels <= 1000000, "few_pixels", self.few_pixels, "0 to 1000000 pixels")
         _require(0.0 <= self.reuse_px <= 1.0e6, "reuse_px", self.reuse_px, "0 (off) or a number of pixels")

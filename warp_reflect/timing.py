@@ -8,13 +8,16 @@ from time import perf_counter
 
 import warp as wp
 
+from warp_reflect.launch import loading_ms
+
 
 class StageTimer:
     """Adds up the time spent in named stages, in the order they were first entered.
 
     `with timer("raster"): ...` counts everything launched inside: on CUDA the device is waited for at both
-    ends (on the CPU a launch returns when it is done). A stage opened inside another is named after it:
-    "search" inside "reflect" is "reflect/search", and counts towards both. For one thread at a time.
+    ends (on the CPU a launch returns when it is done). The loading of kernels is left out. A stage opened inside
+    another is named after it: "search" inside "reflect" is "reflect/search", and counts towards both. For one
+    thread at a time.
 
     Attributes:
         ms: Stage name to milliseconds.
@@ -32,12 +35,12 @@ class StageTimer:
         self.ms.setdefault(full, 0.0)
         self._open.append(full)
         self._wait()
-        start = perf_counter()
+        start, loading = perf_counter(), loading_ms()
         try:
             yield
             self._wait()
         finally:
-            self.ms[full] += 1000.0 * (perf_counter() - start)
+            self.ms[full] += 1000.0 * (perf_counter() - start) - (loading_ms() - loading)
             self._open.pop()
 
     @property

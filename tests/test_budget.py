@@ -1,0 +1,246 @@
+"""Budgets: the arithmetic of costs, the choice among frontiers, what a request gives, and what it came out as."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from rooms import placed, render, room, sphere
+
+import warp_reflect as wr
+from warp_reflect import choice
+from warp_reflect.budget import BUILT_IN, Costs, Work, fixed_ms, loss, predict, speedup
+from warp_reflect.choice import Option, choose, frontier, options_of
+from warp_reflect.planner import keep_pace
+from warp_reflect.realised import realised_error
+from warp_reflect.scene import Scene
+from warp_reflect.settings import Settings
+
+SIZE = (160, 90)
+ONES = Costs(**{each.name: 1.0 for each in dataclasses.fields(Costs)})
+WORK = Work(1000, 200, 100, 65536)
+
+
+@pytest.fixture(scope="module")
+def ball_room(device):
+    return Scene(room(sphere(), placed(0, 0, 0)).data, device)
+
+
+def planned(scene, method="auto", earlier=None, costs=None, **settings):
+    return wr.make_plan(scene, None, SIZE, Settings(threads=1, **settings), method, earlier, costs)
+
+
+# The arithmetic, with costs of one microsecond each.
+
+
+def test_traced_pixels_cost_their_rays_by_the_logarithm_of_the_triangles():
+    assert predict(WORK, "raytraced", Settings(), ONES)["ms"] == pytest.approx(1.001)
+    few = dataclasses.replace(WORK, scene_triangles=256)
+    assert predict(few, "raytraced", Settings(), ONES)["ms"] == pytest.approx(0.501)
+
+
+def test_planar_mirror_costs_a_vertex_a_triangle_and_a_pixel():
+    # 200 vertices, 100 triangles, 1000 pixels refined of which 5 % are traced, 1 for the layer.
+    assert predict(WORK, "planar", Settings(), ONES)["ms"] == pytest.approx(1e-3 * (200 + 100 + 1050 + 1))
+    off = predict(WORK, "planar", Settings(refine="off"), ONES)
+    assert off["ms"] == off["first_ms"] == pytest.approx(1e-3 * (200 + 100 + 1000 + 1))
+
+
+def test_curved_mirror_adds_what_it_cuts_and_a_first_frame_cuts_it():
+    costs = dataclasses.replace(ONES, quadric_cold=5.0)
+    got = predict(WORK, "quadric", Settings(), costs)
+    warm = 2 * 200 + 2 * 100 + 1050 + 1
+    cold = 5 * 200 + 2 * 100 + 1050 + 1 + 200
+    assert got["first_ms"] == pytest.approx(1e-3 * cold)
+    assert got["ms"] == pytest.approx(1e-3 * (0.9 * warm + 0.1 * cold))
+
+
+@pytest.mark.parametrize(
+    "technique", ["raytraced", "planar", "quadric", "reflector_map", "explosion_map", "environment"]
+)
+def test_every_prediction_grows_with_the_work_and_shrinks_with_threads(technique):
+    for settings in (Settings(), Settings(refine="off"), Settings(edge_px=0.0), Settings(grid_error_px=0.1)):
+        less, more = (predict(work, technique, settings) for work in (WORK, dataclasses.replace(WORK, pixels=2000)))
+        assert 0.0 < less["ms"] < more["ms"] and less["ms"] <= less["first_ms"] * (1.0 + 1e-12)
+        two = predict(WORK, technique, settings, threads=2)
+        assert two["ms"] == pytest.approx(less["ms"] / speedup(BUILT_IN, 2))
+        assert all(np.isfinite(value) and value >= 0.0 for value in less.values())
+    assert predict(dataclasses.replace(WORK, pixels=0), technique, Settings())["ms"] == 0.0
+
+
+def test_error_grows_with_what_is_left_approximate():
+    def error(technique="reflector_map", **settings):
+        return predict(dataclasses.replace(WORK, size_px=100.0), technique, Settings(**settings))["error_px"]
+
+    assert error() == error("quadric") == error("raytraced") == 0.0
+    assert 0.0 < error(refine="off") < error(refine="off", edge_px=1.0) < error(refine="off", edge_px=0.0)
+    assert error(refine="off", map_resolution=32) > error(refine="off", map_resolution=256)
+    iterations = [error(refine="off", search="midpoint", iterations=count) for count in (3, 4, 5, 7, 9, 14, 100)]
+    assert iterations == sorted(iterations, reverse=True)
+    assert error(refine="off", grid_error_px=0.2) == pytest.approx(error(refine="off") + 0.2)
+    assert error("quadric", refine="off", reuse_px=0.5) == pytest.approx(error("quadric", refine="off") + 0.5)
+
+
+def test_a_frame_costs_its_view_whatever_is_chosen():
+    assert fixed_ms(10, 20, 30, ONES) == pytest.approx(0.06)
+
+
+# The choice.
+
+
+def option(ms, error, technique="quadric"):
+    numbers = {"ms": ms, "first_ms": ms, "error_px": error, "wrong_share": 0.0, "bytes": 0}
+    return Option(technique, Settings(), numbers)
+
+
+FRONTS = {
+    1: [option(1.0, 4.0), option(2.0, 1.0), option(6.0, 0.0)],
+    2: [option(1.0, 2.0), option(3.0, 0.5)],
+}
+
+
+def test_frontier_drops_what_is_dearer_and_no_better():
+    many = [option(3, 1), option(1, 2), option(2, 2), option(4, 0), option(5, 0)]
+    assert [(each.ms, each.loss) for each in frontier(many)] == [(1, 2), (3, 1), (4, 0)]
+
+
+def test_budget_buys_what_removes_most_error_for_its_time():
+    def bought(budget, **pixels):
+        got = choose(FRONTS, {1: pixels.get("one", 100), 2: pixels.get("two", 100)}, 1.0, budget_ms=budget)
+        return got.options[1].ms, got.options[2].ms
+
+    assert bought(3.0) == (1.0, 1.0)
+    assert bought(4.0) == (2.0, 1.0)  # 3 px for 1 ms before 1.5 px for 2 ms
+    assert bought(6.0) == (2.0, 3.0)
+    assert bought(10.0) == (6.0, 3.0)
+    assert bought(5.0, one=1, two=1000) == (1.0, 3.0)
+
+
+def test_no_plan_exceeds_a_budget_that_can_be_met():
+    for budget in np.linspace(3.0, 12.0, 40):
+        got = choose(FRONTS, {1: 10, 2: 30}, 1.0, budget_ms=budget)
+        assert 1.0 + sum(each.ms for each in got.options.values()) <= budget and not got.notes
+
+
+def test_budget_that_cannot_be_met_says_so_and_takes_the_cheapest():
+    got = choose(FRONTS, {1: 1, 2: 1}, 1.0, budget_ms=0.01)
+    assert [each.ms for each in got.options.values()] == [1.0, 1.0]
+    assert "budget_ms=0.01 cannot be met" in got.notes[0] and "3 ms" in got.notes[0]
+
+
+def test_error_takes_the_cheapest_that_holds_it_and_time_gives_way():
+    got = choose(FRONTS, {1: 1, 2: 1}, 1.0, max_error_px=1.0)
+    assert (got.options[1].ms, got.options[2].ms, got.notes) == (2.0, 3.0, [])
+    got = choose(FRONTS, {1: 1, 2: 1}, 1.0, max_error_px=1.0, budget_ms=0.01)
+    assert (got.options[1].ms, got.options[2].ms) == (2.0, 3.0)
+    assert "budget_ms=0.01 gave way" in got.notes[0] and "max_error_px=1" in got.notes[0]
+    got = choose(FRONTS, {1: 1, 2: 1}, 1.0, max_error_px=0.1)
+    assert got.options[2].ms == 3.0 and "max_error_px=0.1 gave way" in got.notes[0]
+
+
+def test_what_the_user_has_set_is_not_turned():
+    options = options_of({"quadric": WORK, "raytraced": WORK}, Settings(edge_px=0.7, refine="strict"))
+    assert {each.settings.edge_px for each in options} == {0.7}
+    assert {each.settings.refine for each in options} == {"strict"}
+    assert {each.settings.reuse_px for each in options if each.technique == "quadric"} == set(
+        choice.KNOBS["quadric"]["reuse_px"]
+    )
+
+
+# Plans.
+
+
+def test_plan_for_an_error_holds_it(ball_room):
+    for asked in (0.05, 0.3, 1.0):
+        plan = planned(ball_room, "quadric", max_error_px=asked)
+        (row,) = plan.rows
+        assert row.predicted["error_px"] <= asked and f"max_error_px={asked:g}" in row.reason
+        got = realised_error(wr.render_frame(ball_room, plan))
+        assert got.pixels > 500 and got.error_p95_px <= asked
+
+
+def test_dearer_rays_make_a_plan_leave_them(ball_room):
+    techniques = [
+        planned(ball_room, max_error_px=0.5, costs=dataclasses.replace(BUILT_IN, trace=ray)).rows[0].technique
+        for ray in (1e-6, 1e3)
+    ]
+    assert techniques[0] == "raytraced" != techniques[1]
+
+
+def test_contradicting_requests_say_which_gave_way(ball_room):
+    plan = planned(ball_room, budget_ms=0.01, max_error_px=0.01)
+    assert [note for note in plan.notes if "budget_ms=0.01 gave way" in note.text]
+    assert plan.rows[0].predicted["error_px"] <= 0.01
+    assert [note for note in planned(ball_room, budget_ms=0.01).notes if "cannot be met" in note.text]
+
+
+def test_reference_is_never_traded(ball_room):
+    assert planned(ball_room, "reference", budget_ms=0.01).rows[0].technique == "raytraced"
+
+
+def test_larger_budget_is_never_less_accurate(ball_room):
+    losses = []
+    for budget in (0.5, 1.0, 2.0, 4.0, 8.0, 100.0):
+        plan = planned(ball_room, budget_ms=budget)
+        losses.append(loss(plan.rows[0].predicted))
+        assert plan.predicted["ms"] <= budget or any("cannot be met" in note.text for note in plan.notes)
+    assert losses == sorted(losses, reverse=True) and losses[-1] == 0.0
+
+
+# From frame to frame.
+
+
+def test_steady_times_change_nothing(ball_room):
+    plan = planned(ball_room, budget_ms=3.0)
+    assert keep_pace(plan, plan, 2.9, plan.predicted["ms"]) is plan
+    assert keep_pace(plan, plan, 2.2, plan.predicted["ms"]) is plan
+
+
+def test_late_frames_make_the_next_ones_cheaper_and_quality_does_not_flicker(ball_room):
+    """A machine three times as slow as predicted: the plans settle, within the time, and then stay."""
+    (front,) = planned(ball_room, budget_ms=1.0)._fronts.values()
+    fixed = planned(ball_room).fixed_ms
+    budget = 3.3 * (fixed + front[0].ms)
+    assert len(front) > 1
+    plan = planned(ball_room, budget_ms=budget)
+    techniques, spent = [], []
+    for _ in range(12):
+        took = 3.0 * plan.predicted["ms"] / plan.pace
+        spent.append(took)
+        techniques.append((plan.rows[0].technique, plan.rows[0].settings))
+        plan = keep_pace(planned(ball_room, budget_ms=budget), plan, took, plan.predicted["ms"])
+    assert spent[0] > 1.05 * budget, "the first plan has to be too dear for this to test anything"
+    assert max(spent[4:]) <= 1.05 * budget
+    assert len(set(techniques[4:])) == 1
+    assert plan.pace > 1.5
+
+
+def test_frames_pass_their_pace_on(ball_room):
+    first = wr.render_frame(ball_room, planned(ball_room, budget_ms=1e-3))
+    camera = dataclasses.replace(first.camera, eye=first.camera.eye + [0.01, 0, 0])
+    second = wr.render_frame(ball_room, first.plan, camera, previous=first)
+    assert second.plan.pace != 1.0 and second.plan.settings == first.plan.settings
+
+
+# What it came out as.
+
+
+@pytest.mark.parametrize("settings", [{}, {"refine": "off"}, {"refine": "off", "edge_px": 0.0}])
+def test_realised_error_agrees_with_the_whole_comparison(settings, ball_room):
+    frame = render(ball_room, "quadric", **settings)
+    got = realised_error(frame)
+    whole = wr.compare_frames(frame, render(ball_room, "reference"))
+    assert got.pixels >= 0.6 * whole.interior_pixels
+    error = np.where(whole.classes >= 4, np.inf, whole.error_px)[whole.classes >= 2]
+    expected = np.percentile(error, 95, method="lower")
+    assert got.error_p95_px == pytest.approx(expected, rel=0.25, abs=0.02)
+    assert got.wrong_share == pytest.approx((whole.wrong + whole.unmatched) / whole.interior_pixels, abs=0.02)
+
+
+def test_realised_error_of_rays_is_none_and_of_a_near_map_is_large(ball_room):
+    assert realised_error(render(ball_room, "reference")).error_p95_px == 0.0
+    got = realised_error(render(ball_room, "environment"))
+    assert got.error_p95_px > 5.0
+
+
+def test_realised_error_without_mirrors_is_of_nothing(ball_room):
+    assert realised_error(render(ball_room, "none")).pixels == 0

@@ -1,0 +1,144 @@
+"""Which techniques apply to a mirror, and what each would have to do there."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from warp_reflect.budget import Costs, Work, map_blur_px, predict
+from warp_reflect.launch import thread_count
+from warp_reflect.layers import Camera, Reflector
+from warp_reflect.scene import Scene
+from warp_reflect.settings import Settings
+from warp_reflect.techniques import MAPS, TECHNIQUES
+
+PREFERRED = ("planar", "quadric", "reflector_map")  # the exact and cheap first
+JUDGED_IN_PIXELS = ("planar", "quadric")  # whether they apply depends on the view
+# Triangles. Finding out what a larger mesh is (a quadric, convex sheets) takes seconds: `auto` leaves it where the outcome
+# is several sheets at best, or would lose against tracing even if it were one.
+ANALYSED_MAX = 20000
+# Of the error looked for: a bound on the parallax, from boxes alone, that is not worth a closer look.
+PARALLAX_SLACK = 8.0
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A technique that applies to a mirror, why, and what it would have to do."""
+
+    technique: str
+    reason: str
+    work: Work
+
+
+def applies(scene: Scene, reflector: Reflector, camera: Camera, technique: str, settings: Settings) -> tuple[bool, str]:
+    """Whether a technique can reflect a mirror for a camera, and why."""
+    if camera.orthographic and technique not in ("raytraced", *MAPS):
+        return False, "orthographic camera: there is no eye to reflect from"
+    if technique in JUDGED_IN_PIXELS:
+        return TECHNIQUES[technique].applies(scene, reflector, camera, settings.shape_px)
+    return TECHNIQUES[technique].applies(scene, reflector)
+
+
+def work_of(
+    scene: Scene, reflector: Reflector, camera: Camera, technique: str, pixels: int, settings: Settings
+) -> Work:
+    """What a technique that applies has to do for a mirror seen at so many pixels."""
+    part = scene.parts[reflector.part]
+    if technique == "raytraced" or not pixels:
+        return Work(pixels, scene_triangles=scene.triangle_count)
+    module = TECHNIQUES[technique]
+    sheets = technique in ("quadric", "reflector_map")
+    passes, held = module.extent(scene, reflector) if sheets else (1, 1.0)
+    parallax = 0.0
+    if technique == "environment":
+        parallax = module.parallax_px(scene, reflector, camera, settings.threads)
+    return Work(
+        pixels,
+        scene.vertex_count - (part.vertex_count if part.is_whole else 0),
+        scene.triangle_count - part.triangle_count,
+        scene.triangle_count,
+        passes,
+        held,
+        sheets and module.has_branches(scene, reflector, camera),
+        _size_px(pixels),
+        parallax,
+    )
+
+
+def exact_candidates(
+    scene: Scene, reflector: Reflector, camera: Camera, pixels: int, settings: Settings, costs: Costs
+) -> tuple[list[Candidate], list[str]]:
+    """The techniques of `PREFERRED` that apply, in that order, and why the others do not.
+
+    A large mesh is not looked at where that would not pay, see `ANALYSED_MAX`.
+    """
+    part = scene.parts[reflector.part]
+    threads = thread_count(scene.device, settings.threads)
+    rays = predict(
+        work_of(scene, reflector, camera, "raytraced", pixels, settings), "raytraced", settings, costs, threads
+    )
+    found, refused = [], []
+    for name in PREFERRED:
+        if name != "planar" and part.triangle_count > ANALYSED_MAX:
+            vertices = scene.vertex_count - (part.vertex_count if part.is_whole else 0)
+            triangles = scene.triangle_count - part.triangle_count
+            least = predict(Work(pixels, vertices, triangles, scene.triangle_count), name, settings, costs, threads)
+            if rays["ms"] < least["ms"] or not reflector.convex:
+                refused.append(
+                    f"{part.triangle_count} triangles that are not convex together, or dearer to reflect than to trace, "
+                    f"are not analysed by auto (at most {ANALYSED_MAX})"
+                )
+                break
+        good, reason = applies(scene, reflector, camera, name, settings)
+        if good:
+            found.append(Candidate(name, reason, work_of(scene, reflector, camera, name, pixels, settings)))
+        else:
+            refused.append(f"{name}: {reason}")
+    return found, refused
+
+
+def far_environment(
+    scene: Scene, reflector: Reflector, camera: Camera, pixels: int, settings: Settings, error_px: float
+) -> Candidate | None:
+    """An environment map, where all that a mirror shows is so far away that the map is wrong by no more than an error.
+
+    Boxes are asked first; what they cannot rule out is measured in a small picture (`environment.parallax_px`).
+
+    Args:
+        error_px: Parallax and half a texel of the map together. [pixels]
+    """
+    blur = map_blur_px(pixels, settings.environment_resolution)
+    if error_px <= 0.0 or blur > error_px:
+        return None
+    if _size_px(pixels) * _relative_size(scene, reflector.part) > PARALLAX_SLACK * error_px:
+        return None
+    work = work_of(scene, reflector, camera, "environment", pixels, settings)
+    error = work.parallax_px + blur
+    if error > error_px:
+        return None
+    reason = f"all it shows is far: a map at its centre is off by {error:.2g} px, texels included"
+    return Candidate("environment", reason, work)
+
+
+def _size_px(pixels: int) -> float:
+    """Half extent of a round mirror's picture."""
+    return math.sqrt(pixels / math.pi)
+
+
+def _relative_size(scene: Scene, part: int) -> float:
+    """Half extent of a mirror over its distance to the nearest box of anything else; infinite inside one."""
+    own = scene.parts[part]
+    faces = scene.host_triangles[own.first_triangle : own.first_triangle + own.triangle_count]
+    points = scene.host_points[np.unique(faces)].astype(np.float64)
+    if not len(points):
+        return 0.0
+    centre, radius = 0.5 * (points.min(axis=0) + points.max(axis=0)), 0.5 * float(np.ptp(points, axis=0).max())
+    first, _, corners = scene.boxes
+    others = corners[first != own.first_vertex]
+    if not len(others):
+        return 0.0
+    low, high = others[:, 0], others[:, 7]
+    distance = np.linalg.norm(np.maximum(np.maximum(low - centre, centre - high), 0.0), axis=1).min()
+    return radius / distance if distance > 0.0 else math.inf
