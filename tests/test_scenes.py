@@ -157,11 +157,12 @@ def test_scene_takes_the_techniques_it_lists(name, device):
         frame = rendered(name, device, method)
         number = wr.Technique[method.upper()]
         methods = frame["method"]
+        paths = {row.path for row in taken}
         for row in frame.plan.rows:
             own = methods[frame["reflectorId"] == row.reflector.id]
-            assert (own == (number if row in taken else wr.Technique.RAYTRACED)).all(), (method, row.path)
+            assert (own == (number if row.path in paths else wr.Technique.RAYTRACED)).all(), (method, row.path)
         noted = {note.path for note in frame.plan.notes}
-        assert {row.path for row in frame.plan.rows if row not in taken} <= noted
+        assert {row.path for row in frame.plan.rows} - paths <= noted
 
 
 def test_body_with_sharp_rims_is_mapped_in_pieces_beside_one_that_is_whole(device):
