@@ -333,19 +333,32 @@ def test_udim_set_without_a_tile_falls_back_and_is_told(stage):
 @pytest.mark.parametrize(
     ("inputs", "drawn", "told"),
     [
-        ({"opacity": 0.0}, False, "got 0; what has it is not drawn"),
-        ({"opacity": 0.25}, True, "got 0.25; blending is not simulated"),
-        ({"opacity": 0.25, "opacityThreshold": 0.5}, False, "got 0; what has it is not drawn"),
-        ({"opacity": 0.5, "opacityThreshold": 0.5}, True, ""),
-        ({"opacity": 1.0}, True, ""),
+        ({"opacity": 0.0}, (1.0, 1.0), ""),
+        ({"opacity": 0.25}, (1.0, 0.75), ""),
+        ({"opacity": 0.25, "opacityMode": "transparent"}, (1.0, 0.75), ""),
+        ({"opacity": 0.25, "opacityMode": "presence"}, (0.25, 0.0), ""),
+        ({"opacity": 0.0, "opacityMode": "presence"}, None, "got 0; what has it is not drawn"),
+        ({"opacity": 0.25, "opacityThreshold": 0.5}, None, "got 0; what has it is not drawn"),
+        ({"opacity": 0.5, "opacityThreshold": 0.5}, (1.0, 0.0), ""),
+        ({"opacity": 1.0}, (1.0, 0.0), ""),
+        ({"opacity": 7.0}, (1.0, 0.0), "inputs:opacity: got 7"),
     ],
 )
-def test_opacity_is_all_or_nothing(stage, inputs, drawn, told):
+def test_opacity_is_glass_or_absence(stage, inputs, drawn, told):
+    """Opacity and transmission of what is drawn; None: it is not."""
     surface(stage, "UsdPreviewSurface", **inputs)
     samples.add_cube_mesh(stage, "/Cube")
     data = read_stage(samples.saved(stage))
-    assert {i.prim_path for i in data.instances} == ({"/Quad", "/Cube"} if drawn else {"/Cube"})
+    quad = [data.materials[i.materials[0]] for i in data.instances if i.prim_path == "/Quad"]
+    assert [(m.opacity, m.transmission) for m in quad] == ([] if drawn is None else [drawn])
     assert [told in text for text in texts(data)] == ([True] if told else [])
+
+
+def test_an_index_below_that_of_air_is_clamped_with_a_note(stage):
+    surface(stage, "UsdPreviewSurface", ior=0.5, opacity=0.0)
+    data = read_stage(samples.saved(stage))
+    assert data.materials[data.instances[0].materials[0]].ior == 1.0
+    assert ["inputs:ior: got 0.5, used as 1" in text for text in texts(data)] == [True]
 
 
 @pytest.mark.parametrize("threshold", [0.0, 0.5])
@@ -366,7 +379,7 @@ def test_transparent_subset_is_cut_out_of_its_mesh(stage):
     binding = UsdShade.MaterialBindingAPI.Apply(cube.GetPrim())
     faces = {"glass": [0, 1], "paint": [2, 3, 4]}
     subsets = {name: binding.CreateMaterialBindSubset(name, which, "face") for name, which in faces.items()}
-    samples.bind(subsets["glass"], samples.add_material(stage, "/Glass", opacity=0.0))
+    samples.bind(subsets["glass"], samples.add_material(stage, "/Hole", opacity=0.0, opacityThreshold=0.1))
     samples.bind(subsets["paint"], samples.add_material(stage, "/Paint", metallic=0.5))
     data = read_stage(samples.saved(stage))
     (instance,) = data.instances

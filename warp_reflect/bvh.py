@@ -337,6 +337,107 @@ def own_obstacles_kernel(
     out_blocked[i] = wp.uint8(wp.where(hit.status == SKY, 0, 1))
 
 
+@wp.func
+def trace_onward(
+    mesh_id: wp.uint64,
+    scene: SceneView,
+    # Ray:
+    origin: wp.vec3,
+    direction: wp.vec3,
+    normal: wp.vec3,
+    facet: int,
+    inside: int,
+) -> RayHit:
+    """First surface along a ray that has gone through a surface; like `trace_ray` otherwise.
+
+    Args:
+        mesh_id: `Tracer.id`.
+        scene: The same scene's arrays.
+        origin: On the surface, scene frame.
+        direction: Unit length.
+        normal: Of the facet, on the ray's side.
+        facet: Triangle that the ray starts on, never hit.
+        inside: 1: the ray is in the body that the facet belongs to. It does not enter that a second time, nor does a ray
+            outside leave it a second time close by: a point polished onto an analytic surface is off its facets.
+    """
+    result = RayHit()
+    result.triangle = -1
+    result.status = SKY
+    d = flush_direction(direction)
+    offset = ray_offset(origin)
+    start = origin + offset * normal
+    part = scene.patches[scene.triangle_patch[facet]].part
+    t0 = float(0.0)
+    asked = int(0)
+    step = int(0)
+    while step < MAX_STEPS:
+        step += 1
+        query = wp.mesh_query_ray(mesh_id, start + t0 * d, d, FAR)
+        if not query.result:
+            if asked != 0:
+                return result
+            asked = int(1)
+            d = moved_direction(d)
+        else:
+            triangle = query.face
+            t = t0 + query.t
+            tri = scene.triangles[triangle]
+            a = scene.points[tri[0]]
+            b = scene.points[tri[1]]
+            c = scene.points[tri[2]]
+            step_over = triangle == facet
+            if not step_over and scene.patches[scene.triangle_patch[triangle]].part == part:
+                leaves = wp.dot(facet_normal(a, b, c), d) > 0.0
+                longest = wp.max(wp.max(max_abs(b - a), max_abs(c - b)), max_abs(a - c))
+                if inside != 0:
+                    step_over = not leaves and t <= OWN_FACET_REACH * longest
+                else:
+                    step_over = leaves and t <= OWN_FACET_REACH * longest
+            if not step_over:
+                exact = intersect_triangle(origin, direction, a, b, c)
+                result.triangle = triangle
+                result.status = HIT
+                result.t = t
+                # The traversal names its weights for the first and second corner.
+                weights = clamp_weights(query.v, 1.0 - query.u - query.v)
+                if exact.det != 0.0 and wp.min(wp.min(exact.u, exact.v), exact.w) > -0.01:
+                    result.t = wp.max(exact.t, 0.0)
+                    weights = clamp_weights(exact.u, exact.v)
+                result.u = weights[0]
+                result.v = weights[1]
+                return result
+            t0 = t + wp.max(ray_offset(start + t * d), offset)
+    result.status = STEP_LIMIT
+    return result
+
+
+@wp.kernel
+def trace_onward_kernel(
+    first: int,
+    mesh_id: wp.uint64,
+    scene: SceneView,
+    facet: wp.array(dtype=int),
+    point: wp.array(dtype=wp.vec3),
+    normal: wp.array(dtype=wp.vec3),
+    direction: wp.array(dtype=wp.vec3),
+    inside: wp.array(dtype=wp.uint8),
+    # Outputs:
+    out_triangle: wp.array(dtype=int),
+    out_u: wp.array(dtype=float),
+    out_v: wp.array(dtype=float),
+    out_distance: wp.array(dtype=float),
+    out_status: wp.array(dtype=wp.uint8),
+):
+    """One thread per ray."""
+    i = first + wp.tid()
+    hit = trace_onward(mesh_id, scene, point[i], direction[i], normal[i], facet[i], int(inside[i]))
+    out_triangle[i] = hit.triangle
+    out_u[i] = hit.u
+    out_v[i] = hit.v
+    out_distance[i] = hit.t
+    out_status[i] = wp.uint8(hit.status)
+
+
 @wp.kernel
 def trace_shadows_kernel(
     first: int,
@@ -487,6 +588,25 @@ def trace_pixels(
     before = wp.clone(layer.status)
     launch.launch(retry_pixels_kernel, count, [*rays, before, *outputs], scene.device, threads)
     return count
+
+
+def trace_transmitted(
+    scene: Scene, layer: ReflectionLayer, facet: wp.array, inside: wp.array, threads: int = 0
+) -> None:
+    """Follow rays that have gone through a surface and write their hits into the layer.
+
+    Args:
+        scene: Its BVH is built if this is the first use.
+        layer: Its pixels' points, directions, and normals of their facets on the rays' side; receives triangle, u, v,
+            distance and status.
+        facet: int32 [n], the triangle that each ray starts on.
+        inside: uint8 [n], 1 where the ray is in the body of its facet.
+        threads: CPU threads; 0: one per core.
+    """
+    pixels = layer.pixels
+    inputs = [wp.uint64(scene.tracer.id), scene.view, facet, pixels.point, pixels.normal, pixels.direction, inside]
+    outputs = [layer.triangle, layer.u, layer.v, layer.distance, layer.status]
+    launch.launch(trace_onward_kernel, pixels.count, inputs + outputs, scene.device, threads, split_min=TRACE_SPLIT_MIN)
 
 
 def own_obstacles(scene: Scene, gbuffer: GBuffer, pixels: MirrorPixels, part: int, threads: int = 0) -> wp.array:

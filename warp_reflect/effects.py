@@ -31,3 +31,25 @@ def finish_effects(scene: Scene, part: PartRange, visible: bool, settings: Setti
     if not visible:
         return {name: Effect(False, "not seen from the camera") for name in FINISHES}
     return {}
+
+
+def pane_effects(
+    scene: Scene, part: PartRange, interface: str, reason: str, pixels: int, settings: Settings
+) -> dict[str, Effect]:
+    """What is simulated of a transparent surface.
+
+    Args:
+        scene, part: The surface's.
+        interface: "thin" or "solid".
+        reason: Why it is that.
+        pixels: At which the plan's camera sees it.
+        settings: The plan's.
+    """
+    material = scene.data.materials[part.material]
+    seen = f"{pixels} pixels" if pixels else "not seen from the camera, but perhaps in mirrors and behind others"
+    depth = f"up to {settings.transparency_depth} surfaces behind one another (transparency_depth)"
+    numbers = {"opacity": material.opacity, "transmission": material.transmission, "pixels": pixels}
+    return {
+        "transparency": Effect(True, f"opacity {material.opacity:g}, {seen}, {depth}", numbers),
+        "refraction": Effect(interface == "solid", reason, {"ior": material.ior}),
+    }

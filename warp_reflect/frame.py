@@ -5,12 +5,13 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import os
+from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
 import warp as wp
 
-from warp_reflect import __version__, images, motion, raster, shade, surface
+from warp_reflect import __version__, images, motion, raster, shade, surface, transmission
 from warp_reflect.channels import CHANNELS, POINTS, component_of, known_names, reflection_channels
 from warp_reflect.effects import FINISHES
 from warp_reflect.layers import Camera, GBuffer, MirrorPixels, ReflectionLayer, add_statistics
@@ -31,6 +32,7 @@ class Frame:
         scene, plan, camera: What it was made from.
         gbuffer: What the eye sees.
         layers: Reflector id to its `ReflectionLayer`.
+        transmitted: Part of a transparent surface to what the eye sees through it.
         statistics: Counts over all reflectors: pixels settled by `candidate`, `walk`, `empty`, `bvh`; vertices; ...; the
             largest bounds: `reused_px`.
         timings: Milliseconds per stage.
@@ -46,6 +48,7 @@ class Frame:
         picture: tuple,
         timings: dict[str, float],
         previous: Frame | None = None,
+        transmitted: dict[int, transmission.Transmission] | None = None,
     ):
         # Not the previous frame itself: each would keep the one before it alive.
         self._before = None if previous is None else (previous.scene, previous.camera)
@@ -55,7 +58,8 @@ class Frame:
         self._picture = picture
         self.kept = _kept(layers, previous)
         self.statistics: dict = {}
-        for layer in layers.values():
+        self.transmitted = transmitted or {}
+        for layer in (*layers.values(), *(each.layer for each in self.transmitted.values())):
             add_statistics(self.statistics, layer.statistics)
 
     @property
@@ -232,20 +236,25 @@ def render_frame(scene: Scene, plan: Plan, camera: str | Camera | None = None, p
     settings = plan.settings
     view = plan.camera if camera is None else find_camera(scene, camera, plan.size)
     gbuffer, layers = reflect_scene(scene, plan, view, timer, previous)
-    kept, finish = _kept(layers, previous), _finish(scene, plan)
+    behind = _behind(scene, plan)
+    kept, finish = _kept(layers, previous), _finish(scene, plan, behind)
     # What moves with time without moving anything, such as waves, is a finish.
     same_time = finish is None or (previous and previous.scene.data.time == scene.data.time)
     same_layers = previous and gbuffer is previous.gbuffer and len(kept) == len(layers)
     if same_layers and same_time and previous.plan.settings == settings:
-        picture = previous._picture
+        picture, transmitted = previous._picture, previous.transmitted
     else:
         with timer("shade"):
             picture = shade.shade(scene, gbuffer, layers, settings.threads, settings.shadows, finish)
+        transmitted = {}
+        if behind is not None:
+            with timer("transmission"):
+                transmitted = _look_through(scene, plan, gbuffer, picture, behind)
     timings = timer.ms
     for id in layers.keys() - kept:
         for step, ms in layers[id].timings.items():
             timings["reflect/" + step] = timings.get("reflect/" + step, 0.0) + ms
-    return Frame(scene, plan, gbuffer, layers, picture, timings, previous)
+    return Frame(scene, plan, gbuffer, layers, picture, timings, previous, transmitted)
 
 
 def reflect_scene(
@@ -287,14 +296,45 @@ def reflect_scene(
     return gbuffer, layers
 
 
-def _finish(scene: Scene, plan: Plan) -> shade.Finish | None:
+# What a layer's rays see, with what is behind the transparent surfaces among it.
+Behind = Callable[[GBuffer, ReflectionLayer, wp.array], wp.array]
+
+
+def _behind(scene: Scene, plan: Plan) -> Behind | None:
+    """How transparent surfaces are looked through; None where there are none."""
+    if not plan.panes:
+        return None
+    interfaces = transmission.interface_views(scene)
+
+    def behind(gbuffer: GBuffer, layer: ReflectionLayer, seen: wp.array) -> wp.array:
+        return transmission.behind(scene, gbuffer, interfaces, layer, seen, plan.settings)
+
+    return behind
+
+
+def _look_through(
+    scene: Scene, plan: Plan, gbuffer: GBuffer, picture: tuple, behind: Behind
+) -> dict[int, transmission.Transmission]:
+    """Add to a picture what the eye sees through transparent surfaces; it, by the surfaces' parts."""
+    threads = plan.settings.threads
+    parts = {pane.part for pane in plan.panes}
+    shown = transmission.look_through(scene, gbuffer, transmission.interface_views(scene), parts, plan.settings)
+    for found in shown.values():
+        seen = shade.seen_radiance(scene, gbuffer, found.layer, threads, plan.settings.shadows)
+        transmission.add_to_picture(picture[0], found, behind(gbuffer, found.layer, seen), threads)
+    return shown
+
+
+def _finish(scene: Scene, plan: Plan, behind: Behind | None) -> shade.Finish | None:
     """What the planned finishes make of what sharp mirrors see; None where every mirror is sharp and plain."""
     planned = {row.reflector.id: [name for name in FINISHES if row.effects[name].on] for row in plan.rows}
-    if not any(planned.values()):
+    if not any(planned.values()) and behind is None:
         return None
     rows = {row.reflector.id: row for row in plan.rows}
 
     def finish(shown: shade.Shown, layer: ReflectionLayer, sharp: wp.array) -> wp.array:
+        if behind is not None and layer.radiance is None:
+            sharp = behind(shown.gbuffer, layer, sharp)
         radiance, reflector = sharp, layer.pixels.reflector
         for name in planned[reflector]:
             module = importlib.import_module(f"warp_reflect.finishes.{FINISHES[name]}")

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from warp_reflect import __version__, applicable, choice, raster
+from warp_reflect import __version__, applicable, choice, raster, transmission
 from warp_reflect.applicable import PREFERRED
 from warp_reflect.budget import BUILT_IN, Costs, fixed_ms, predict
-from warp_reflect.effects import Effect, finish_effects
+from warp_reflect.effects import Effect, finish_effects, pane_effects
 from warp_reflect.launch import thread_count
 from warp_reflect.layers import Camera, Reflector
 from warp_reflect.reflectors import mirror_weight
@@ -48,7 +48,21 @@ class PlanRow:
     @property
     def name(self) -> str:
         """The mirror's prim path, with which copy and which subset of it."""
-        return self.path + (f"[{self.instance}]" if self.instance else "") + (f":{self.subset}" if self.subset else "")
+        return _name(self)
+
+
+@dataclass(frozen=True)
+class PaneRow:
+    """What is simulated for one transparent surface."""
+
+    part: int
+    path: str
+    subset: str
+    instance: str
+    interface: str  # "thin" or "solid"
+    pixels: int
+    effects: dict[str, Effect]
+    settings: Settings
 
 
 @dataclass
@@ -57,6 +71,7 @@ class Plan:
 
     Attributes:
         rows: One `PlanRow` per reflector, in the order of their ids.
+        panes: One `PaneRow` per transparent surface, in the order of their parts.
         notes: What the user should know about the plan, beside the scene's own notes.
         costs: What the machine's steps cost.
         pace: Milliseconds that took place for one that was predicted, learnt where a time is asked for.
@@ -67,6 +82,7 @@ class Plan:
     settings: Settings
     method: str
     rows: list[PlanRow]
+    panes: list[PaneRow]
     notes: list[Note]
     costs: Costs = BUILT_IN
     pace: float = 1.0
@@ -137,14 +153,30 @@ class Plan:
                 }
                 for row in self.rows
             ],
+            "panes": [
+                {
+                    "path": pane.path,
+                    "subset": pane.subset,
+                    "instance": pane.instance,
+                    "interface": pane.interface,
+                    "pixels": pane.pixels,
+                    "effects": {name: dataclasses.asdict(effect) for name, effect in pane.effects.items()},
+                }
+                for pane in self.panes
+            ],
             "notes": [{"path": note.path, "text": note.text} for note in [*self.scene.notes, *self.notes]],
         }
 
     def __str__(self) -> str:
         width, height = self.camera.size
         lines = [f"{self.scene.data.source}  camera {self.camera.path}  {width}x{height}"]
+        panes = []
+        for pane in self.panes:
+            panes.append(f"pane {_name(pane)}  {pane.interface}  {pane.pixels:,d} pixels")
+            panes += [f"    {'on ' if each.on else 'off'} {name}: {each.reason}" for name, each in pane.effects.items()]
         if not self.rows:
-            return "\n".join([*lines, "no reflector: nothing is simulated beyond the direct picture"])
+            none = "no reflector: nothing is simulated beyond the direct picture"
+            return "\n".join([*lines, none.replace("beyond", "in mirrors beyond") if panes else none, *panes])
         names = [row.name for row in self.rows]
         column = max(len("mirror"), *map(len, names))
         technique = max(len("technique"), *(len(row.technique) + 7 * row.forced for row in self.rows))
@@ -159,10 +191,16 @@ class Plan:
             lines.append(f"{row.reflector.id:3d} {name:{column}}  {chosen:{technique}}  {row.pixels:9,d}  {numbers}")
             lines.append(f"    {row.reason}")
             lines += [f"    {'on ' if each.on else 'off'} {name}: {each.reason}" for name, each in row.effects.items()]
+        lines += panes
         whole = self.predicted
         times = f"{whole['ms']:.3g} ms, {whole['first_ms']:.3g} ms from nothing"
         lines.append(f"a frame: {times}, {whole['error_px']:.2g} px (predicted)")
         return "\n".join(lines)
+
+
+def _name(row: PlanRow | PaneRow) -> str:
+    """The surface's prim path, with which copy and which subset of it."""
+    return row.path + (f"[{row.instance}]" if row.instance else "") + (f":{row.subset}" if row.subset else "")
 
 
 def keep_pace(plan: Plan, before: Plan, spent_ms: float, expected_ms: float) -> Plan:
@@ -233,17 +271,19 @@ def make_plan(
         for k, part in enumerate(scene.parts)
         if asked and (weight := mirror_weight(scene, part, settings))
     ]
-    pixels = _pixel_counts(scene, view, [k for k, _, _ in found], settings)
+    clear = [k for k, part in enumerate(scene.parts) if transmission.is_transparent(scene, part)]
+    pixels = _pixel_counts(scene, view, [*(k for k, _, _ in found), *clear], settings)
     rows = [
         _row(scene, view, settings, method, number, part_index, part, weight, pixels[part_index], notes, costs)
         for number, (part_index, part, weight) in enumerate(found, 1)
     ]
+    panes = [_pane(scene, settings, k, pixels[k]) for k in clear]
     bumpy = [scene.data.materials[part.material] for _, part, _ in found]
     for path in dict.fromkeys(material.path for material in bumpy if "normal" in material.textures):
         notes.append(
             Note(path, "texture of normal: a mirror reflects at the surface itself; its normal map is not used")
         )
-    made = Plan(scene, view, settings, method, rows, notes, costs)
+    made = Plan(scene, view, settings, method, rows, panes, notes, costs)
     _fit(made, 1.0 if earlier is None else earlier.pace)
     _take_over(made, earlier)
     return made
@@ -346,6 +386,13 @@ def _row(scene, camera, settings, method, number, part_index, part, weight, pixe
         settings,
         _predicted(scene, reflector, camera, technique, pixels, settings, costs),
     )
+
+
+def _pane(scene, settings, part_index, pixels) -> PaneRow:
+    part = scene.parts[part_index]
+    interface, reason = transmission.interface_of(scene, part_index)
+    effects = pane_effects(scene, part, interface, reason, pixels, settings)
+    return PaneRow(part_index, part.prim_path, part.subset, part.instance, interface, pixels, effects, settings)
 
 
 def _predicted(scene, reflector, camera, technique, pixels, settings, costs) -> dict:
@@ -474,8 +521,13 @@ def _effects(scene, part, technique, pixels, weight, settings) -> dict[str, Effe
     searched = not traced and not mapped
     no_search = "maps are looked up" if mapped else "no search"
     visible = pixels > 0
-    chosen = scene.data.materials[part.material].mirror is not None
-    bound = "chosen by name" if chosen else f">= {settings.reflector_min_weight} (reflector_min_weight)"
+    material = scene.data.materials[part.material]
+    bound = f">= {settings.reflector_min_weight} (reflector_min_weight)"
+    if material.transmission > 0.0:
+        kept = f"{1.0 - material.transmission:g}, what is not let through"
+        bound = f">= {kept}, x {settings.reflector_min_weight} (reflector_min_weight)"
+    if material.mirror is not None:
+        bound = "chosen by name"
     return {
         "reflection": Effect(
             visible,

@@ -21,6 +21,8 @@ def mirror_weight(scene: Scene, part: PartRange, settings: Settings) -> float:
     coated = material.clearcoat >= CLEARCOAT_MIN and material.clearcoat_roughness <= settings.reflector_max_roughness
     if coated:
         return max(weight, CLEARCOAT_MIN)
-    if material.roughness <= settings.reflector_max_roughness and weight >= settings.reflector_min_weight:
+    # What a mirror's picture has to stand out from is what the surface scatters; through clear glass nothing is.
+    least = settings.reflector_min_weight * (1.0 - material.transmission)
+    if material.roughness <= settings.reflector_max_roughness and weight >= least:
         return weight
     return 0.0

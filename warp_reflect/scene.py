@@ -125,6 +125,20 @@ class MirrorData:
 
 
 @dataclass(frozen=True)
+class FinishData:
+    """What the user asks of a surface for what is seen in it and through it (`WarpReflectFinishAPI`)."""
+
+    path: str  # the prim with the API
+    interface: str = "auto"  # or "thin", "solid": how light goes through
+    fade_distance: float = 0.0  # over which what is seen fades to 1 / e, 0: it does not [scene units]
+    fade_color: tuple[float, float, float] = (0.0, 0.0, 0.0)  # what it fades to, radiance
+    frost: float = 0.0  # half-angle into which what is seen through is scattered [degrees]
+    wave_slope: float = 0.0  # root mean square of the waves' slopes, 0: still
+    wave_length: float = 1.0  # of the longest wave [scene units]
+    wave_speed: float = 1.0  # of the longest wave [scene units per second]
+
+
+@dataclass(frozen=True)
 class EnvironmentMapData:
     """The place of a reference environment map (`WarpReflectEnvironmentMapAPI`)."""
 
@@ -149,13 +163,16 @@ class MaterialData:
     ior: float = 1.5
     specular_workflow: bool = False
     specular_color: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    opacity: float = 1.0
+    opacity: float = 1.0  # share of the surface that is there at all; through the rest one looks straight
+    # Share of the light that enters the surface which goes through instead of being scattered back (glass, water).
+    transmission: float = 0.0
     emissive: tuple[float, float, float] = (0.0, 0.0, 0.0)
     clearcoat: float = 0.0
     clearcoat_roughness: float = 0.01
     uses_vertex_color: bool = False  # base_color is replaced by MeshData.colors
     textures: dict[str, TextureRef] = field(default_factory=dict)  # by field name: "roughness" ...; "normal"
     mirror: MirrorData | None = None  # None: its values decide whether it is a mirror
+    finish: FinishData | None = None
 
 
 @dataclass(frozen=True)
@@ -244,6 +261,8 @@ class MaterialView:
     clearcoat: float
     clearcoat_roughness: float
     clearcoat_f0: float
+    opacity: float
+    transmission: float
     uses_vertex_color: int
     specular_workflow: int
 
@@ -602,6 +621,8 @@ def material_view(material: MaterialData) -> MaterialView:
     view.clearcoat = material.clearcoat
     view.clearcoat_roughness = material.clearcoat_roughness
     view.clearcoat_f0 = ((1.0 - material.ior) / (1.0 + material.ior)) ** 2
+    view.opacity = material.opacity
+    view.transmission = material.transmission
     view.uses_vertex_color = int(material.uses_vertex_color)
     view.specular_workflow = int(material.specular_workflow)
     return view

@@ -118,6 +118,8 @@ class Settings:
     """`low`, `medium`, `high`, `veryhigh`: subdivision level 0-3, and the tessellation of gprims, as in usdrecord."""
     bounces: int = 1
     """Mirrors seen in mirrors, in mirrors ...: how many reflections are followed; beyond them a mirror shows the dome."""
+    transparency_depth: int = 8
+    """Transparent surfaces behind one another that are looked through; nothing is seen through the next."""
     threads: int = 0
     """CPU threads of a launch; 0: one per core."""
     shadows: bool = False
@@ -163,6 +165,8 @@ class Settings:
         _require(
             update in ENVIRONMENT_UPDATES, "environment_update", update, f"one of {', '.join(ENVIRONMENT_UPDATES)}"
         )
+        depth = self.transparency_depth
+        _require(0 <= depth <= 64, "transparency_depth", depth, "0 to 64 surfaces")
         _require(0 <= self.walk_hops <= 64, "walk_hops", self.walk_hops, "0 to 64")
         _require(self.field_kind in FIELDS, "field_kind", self.field_kind, f"one of {', '.join(FIELDS)}")
         _require(0.0 <= self.field_cell <= 1.0e9, "field_cell", self.field_cell, "0 (automatic) or a length")

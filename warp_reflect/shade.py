@@ -14,7 +14,8 @@ Approximates UsdPreviewSurface, textures included (`textures.py`):
 * energy: what the clear coat and the mirror term take is taken from the layers below;
 * normal maps turn the normal of what is no reflector, seen directly or in one; a reflector keeps its own.
 
-Opacity is not looked at. The background is the dome; alpha is coverage.
+What is seen through a surface is not here (`transmission.py`), but its share is left for it. The background is the dome;
+alpha is coverage.
 """
 
 from __future__ import annotations
@@ -254,10 +255,11 @@ def irradiance_at(lights: LightView, direct: wp.array(dtype=wp.vec3), i: int, n:
 
 @wp.struct
 class Lobes:
-    """What a surface does with light at one point and angle: base + mirror * radiance(reflected)."""
+    """What a surface does with light at one point and angle: base + mirror * radiance(reflected) + through * radiance(behind)."""
 
     base: wp.vec3
     mirror: wp.vec3
+    through: wp.vec3
 
 
 @wp.func
@@ -278,7 +280,7 @@ def sharp_share(roughness: float, reflector: bool) -> float:
 
 @wp.func
 def split_lobes(look: Look, irradiance: wp.vec3, cosine: float, reflector: bool) -> Lobes:
-    """Base radiance and mirror weight of a surface.
+    """Base radiance, mirror weight and weight of what is behind a surface.
 
     `irradiance` is that of the viewer's side, `cosine` that of the angle of incidence.
     """
@@ -288,7 +290,8 @@ def split_lobes(look: Look, irradiance: wp.vec3, cosine: float, reflector: bool)
         mirror = sharp * schlick(look.f0, look.f90, cosine)
     blurred = (1.0 - sharp) * look.f0
     # F90 is 1 for a dielectric and the colour itself for a metal: the difference reaches the diffuse layer.
-    albedo = blurred + wp.cw_mul(look.f90 - mirror - blurred, look.base_color)
+    albedo = blurred + (1.0 - look.transmission) * wp.cw_mul(look.f90 - mirror - blurred, look.base_color)
+    through = look.transmission * (wp.vec3(1.0, 1.0, 1.0) - mirror - blurred)
     if look.clearcoat > 0.0:
         f0 = look.clearcoat_f0
         coat = look.clearcoat * schlick(wp.vec3(f0, f0, f0), wp.vec3(1.0, 1.0, 1.0), cosine)[0]
@@ -296,9 +299,12 @@ def split_lobes(look: Look, irradiance: wp.vec3, cosine: float, reflector: bool)
         blurred_coat = coat - sharp_coat
         albedo = (1.0 - coat) * albedo + wp.vec3(blurred_coat, blurred_coat, blurred_coat)
         mirror = (1.0 - coat) * mirror + wp.vec3(sharp_coat, sharp_coat, sharp_coat)
+        through = (1.0 - coat) * through
+    absent = 1.0 - look.opacity
     lobes = Lobes()
-    lobes.base = look.emissive + wp.cw_mul(albedo, (1.0 / PI) * irradiance)
-    lobes.mirror = mirror
+    lobes.base = look.opacity * (look.emissive + wp.cw_mul(albedo, (1.0 / PI) * irradiance))
+    lobes.mirror = look.opacity * mirror
+    lobes.through = look.opacity * through + wp.vec3(absent, absent, absent)
     return lobes
 
 
@@ -308,6 +314,23 @@ def weights_matter(scene: SceneView, triangle: int) -> bool:
     if scene.normal_index[triangle][0] >= 0 or scene.color_index.shape[0] > 0:
         return True
     return scene.patches[scene.triangle_patch[triangle]].shape == SHAPE_QUADRIC
+
+
+@wp.func
+def weights_seen(scene: SceneView, camera: CameraView, triangle: int, x: float, y: float) -> wp.vec2:
+    """Weights of a triangle's second and third corner at pixel coordinate (x, y), where they matter for shading."""
+    uv = wp.vec2(0.0, 0.0)
+    if weights_matter(scene, triangle):
+        corner = scene.triangles[triangle]
+        hit = intersect_triangle(
+            eye_ray_origin(camera, x, y),
+            eye_ray_direction(camera, x, y),
+            scene.points[corner[0]] - camera.eye,
+            scene.points[corner[1]] - camera.eye,
+            scene.points[corner[2]] - camera.eye,
+        )
+        uv = clamp_weights(hit.u, hit.v)
+    return uv
 
 
 @wp.func
@@ -367,25 +390,14 @@ def shade_kernel(
     x = float(i - row * camera.width) + 0.5
     y = float(row) + 0.5
     tri = triangle[i]
-    ray = eye_ray_direction(camera, x, y)
-    incident = unit(ray)
+    incident = unit(eye_ray_direction(camera, x, y))
     base = wp.vec3(0.0, 0.0, 0.0)
     weight = wp.vec3(1.0, 1.0, 1.0)
     onward = incident
     reflector = reflector_id[i] > 0
     coverage = float(0.0)
     if tri >= 0:
-        uv = wp.vec2(0.0, 0.0)
-        if weights_matter(scene, tri):
-            corner = scene.triangles[tri]
-            hit = intersect_triangle(
-                eye_ray_origin(camera, x, y),
-                ray,
-                scene.points[corner[0]] - camera.eye,
-                scene.points[corner[1]] - camera.eye,
-                scene.points[corner[2]] - camera.eye,
-            )
-            uv = clamp_weights(hit.u, hit.v)
+        uv = weights_seen(scene, camera, tri, x, y)
         n = shown_normal(normals, i, hit_normal(scene, tri, uv[0], uv[1]))
         cosine = wp.dot(n, incident)
         onward = incident - 2.0 * cosine * n

@@ -459,6 +459,8 @@ class Look:
     clearcoat: float
     clearcoat_roughness: float
     clearcoat_f0: float
+    opacity: float
+    transmission: float
 
 
 @wp.func
@@ -471,6 +473,8 @@ def with_base(look: Look, color: wp.vec3, metallic: float) -> Look:
     result.clearcoat = look.clearcoat
     result.clearcoat_roughness = look.clearcoat_roughness
     result.clearcoat_f0 = look.clearcoat_f0
+    result.opacity = look.opacity
+    result.transmission = look.transmission
     result.base_color = color
     result.f0 = wp.vec3(dielectric, dielectric, dielectric) + metallic * color
     result.f90 = wp.vec3(1.0 - metallic, 1.0 - metallic, 1.0 - metallic) + metallic * color
@@ -490,6 +494,8 @@ def plain_look(scene: SceneView, triangle: int, u: float, v: float) -> Look:
     look.clearcoat = scene.materials[material].clearcoat
     look.clearcoat_roughness = scene.materials[material].clearcoat_roughness
     look.clearcoat_f0 = scene.materials[material].clearcoat_f0
+    look.opacity = scene.materials[material].opacity
+    look.transmission = scene.materials[material].transmission
     if scene.materials[material].uses_vertex_color != 0 and scene.color_index.shape[0] > 0:
         index = scene.color_index[triangle]
         if index[0] >= 0:

@@ -36,6 +36,7 @@ class _Parameter:
     field: str
     default: float | tuple[float, float, float]
     high: float = np.inf
+    low: float = 0.0
     weight: str = ""
     weight_default: float = 1.0
 
@@ -58,7 +59,7 @@ _PREVIEW = (
     _Parameter("clearcoat", "clearcoat", 0.0, 1.0),
     _Parameter("clearcoatRoughness", "clearcoat_roughness", 0.01, 1.0),
     _Parameter("opacity", "opacity", 1.0, 1.0),
-    _Parameter("ior", "ior", 1.5),
+    _Parameter("ior", "ior", 1.5, low=1.0),
 )
 _STANDARD = (
     _Parameter("base_color", "base_color", _GREY, weight="base"),
@@ -68,7 +69,8 @@ _STANDARD = (
     _Parameter("coat", "clearcoat", 0.0, 1.0),
     _Parameter("coat_roughness", "clearcoat_roughness", 0.1, 1.0),
     _Parameter("opacity", "opacity", 1.0, 1.0),
-    _Parameter("specular_IOR", "ior", 1.5),
+    _Parameter("specular_IOR", "ior", 1.5, low=1.0),
+    _Parameter("transmission", "transmission", 0.0, 1.0),
 )
 _OPEN_PBR = (
     _Parameter("base_color", "base_color", _GREY, weight="base_weight"),
@@ -78,7 +80,8 @@ _OPEN_PBR = (
     _Parameter("coat_weight", "clearcoat", 0.0, 1.0),
     _Parameter("coat_roughness", "clearcoat_roughness", 0.0, 1.0),
     _Parameter("geometry_opacity", "opacity", 1.0, 1.0),
-    _Parameter("specular_ior", "ior", 1.5),
+    _Parameter("specular_ior", "ior", 1.5, low=1.0),
+    _Parameter("transmission_weight", "transmission", 0.0, 1.0),
 )
 SURFACES = {
     "UsdPreviewSurface": _PREVIEW,
@@ -92,8 +95,6 @@ UNUSED_PREVIEW = {"displacement": 0.0}
 UNUSED = {
     "specular": 1.0,
     "specular_weight": 1.0,
-    "transmission": 0.0,
-    "transmission_weight": 0.0,
     "subsurface": 0.0,
     "subsurface_weight": 0.0,
     "sheen": 0.0,
@@ -290,7 +291,11 @@ def _read_surface(shader: UsdShade.Shader, parameters, path: str, intake: Intake
 
 
 def _read_opacity(shader, values: dict, textures: dict, primvars: list, path: str, intake: Intake) -> None:
-    """Opacity by the rules of UsdPreviewSurface; of a picture there is none."""
+    """Opacity by the rules of UsdPreviewSurface; of a picture there is none.
+
+    Without a threshold and in the mode "transparent", the default, what is not opaque lets light through and still mirrors, as
+    glass does; otherwise, and in MaterialX, that share of the surface is not there.
+    """
     threshold = value_of(shader, "opacityThreshold", intake)
     threshold = float(threshold) if isinstance(threshold, (int, float)) and np.isfinite(threshold) else 0.0
     if textures.pop("opacity", None) is not None:
@@ -301,6 +306,8 @@ def _read_opacity(shader, values: dict, textures: dict, primvars: list, path: st
         return
     elif threshold > 0.0:
         values["opacity"] = float(values["opacity"] >= threshold)
+    elif "transmission" not in values and value_of(shader, "opacityMode", intake) in (None, "transparent"):
+        values["transmission"], values["opacity"] = 1.0 - values["opacity"], 1.0
 
 
 def _read_normal(shader: UsdShade.Shader, intake: Intake) -> TextureRef | None:
@@ -397,7 +404,7 @@ def _constant(array: np.ndarray, path, parameter: _Parameter, intake: Intake):
 
 def _fitted(array: np.ndarray, parameter: _Parameter):
     """A value clipped to the parameter's range, as a float or three; a colour for a number is its mean."""
-    clipped = np.clip(np.nan_to_num(array), 0.0, parameter.high)
+    clipped = np.clip(np.nan_to_num(array), parameter.low, parameter.high)
     if parameter.width == 1:
         return float(clipped.mean())
     return tuple(float(v) for v in np.broadcast_to(clipped, (3,)))

@@ -1,4 +1,4 @@
-"""What is wholly transparent is not drawn, and neither reflects nor is reflected; what is partly so is opaque."""
+"""What is not there at all is not drawn, and neither reflects nor is reflected."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from warp_reflect.stage.intake import Intake
 
 
 def drop_transparent(data: SceneData, intake: Intake) -> None:
-    """Take out the parts whose material has opacity 0; what the user calls a mirror stays. Both are noted.
+    """Take out the parts whose material has opacity 0, with a note; what the user calls a mirror stays.
 
     Args:
         data: Its instances and meshes are replaced where they lose parts.
@@ -22,11 +22,6 @@ def drop_transparent(data: SceneData, intake: Intake) -> None:
         for index, material in enumerate(data.materials)
         if material.opacity == 0.0 and not (material.mirror is not None and material.mirror.include)
     }
-    for instance in data.instances:
-        for material in (data.materials[k] for k in instance.materials):
-            if 0.0 < material.opacity < 1.0:
-                path = material.path or instance.prim_path
-                intake.note(path, f"opacity: got {material.opacity:g}; blending is not simulated, it is drawn opaque")
     if not hidden:
         return
     reduced: dict[tuple, int] = {}

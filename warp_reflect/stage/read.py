@@ -20,6 +20,7 @@ from pxr import Sdf, Tf, Usd, UsdGeom, UsdUtils  # isort: skip
 
 from warp_reflect.stage.assemble import Assembly, MeshEntry
 from warp_reflect.stage.baked import read_baked_maps
+from warp_reflect.stage.finish import give_finishes
 from warp_reflect.stage.lights import SHADED_KINDS, default_dome
 from warp_reflect.stage.materialx import is_materialx_error
 from warp_reflect.stage.opacity import drop_transparent
@@ -138,6 +139,7 @@ class StageReader:
         data.environment_maps = walk.environment_maps
         Assembly(intake, self.level, choices, self._static).complete(data, walk.drawn, placed)
         choose_reflectors(data, choices)
+        give_finishes(data, walk.finishes)
         drop_transparent(data, intake)
         data.baked_maps = read_baked_maps(walk.drawn, intake)
         if not data.instances:

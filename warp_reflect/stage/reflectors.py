@@ -59,11 +59,13 @@ class Choices:
             if matches(pattern, names, self.collections):
                 self.matched.add(pattern)
                 chosen = choice
-        if chosen is None and self.prims:
-            above = {path for name in names for path in _ancestors(name)} & self.prims.keys()
-            if above:
-                chosen = self.prims[max(above, key=lambda path: path.count("/"))]
-        return chosen
+        return nearest_above(names, self.prims) if chosen is None else chosen
+
+
+def nearest_above(names: tuple[str, ...], asked: dict):
+    """What is asked for at the nearest prim above any of the names, or at one of them; None: nothing."""
+    above = {path for name in names for path in _ancestors(name)} & asked.keys() if asked else ()
+    return asked[max(above, key=lambda path: path.count("/"))] if above else None
 
 
 def parse_patterns(texts: tuple[str, ...] | str) -> dict[str, Choice]:
@@ -197,6 +199,9 @@ def mirrored(material: MaterialData, choice: Choice) -> MaterialData:
     if not may_reflect(material):
         neutral = {"metallic": NEUTRAL_METALLIC, "roughness": NEUTRAL_ROUGHNESS, "base_color": NEUTRAL_COLOR}
         values = {name: neutral[name] if value is None else value for name, value in values.items()}
+        values["transmission"] = 0.0
+    if material.opacity == 0.0:
+        values["opacity"] = 1.0
     values = {name: value for name, value in values.items() if value is not None and value != KEEP}
     if "base_color" in values:
         values["uses_vertex_color"] = False
@@ -216,4 +221,5 @@ def may_reflect(material: MaterialData) -> bool:
     if "base_color" in material.textures:
         best = dataclasses.replace(best, base_color=(1.0, 1.0, 1.0))
     weight = float(reflectance(best)[0].max())
-    return roughness <= defaults.reflector_max_roughness and weight >= defaults.reflector_min_weight
+    least = defaults.reflector_min_weight * (1.0 - material.transmission)
+    return roughness <= defaults.reflector_max_roughness and weight >= least

@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from pxr import Tf, Usd, UsdGeom
 
-from warp_reflect.scene import CameraData, EnvironmentMapData, InstanceData, LightData
+from warp_reflect.scene import CameraData, EnvironmentMapData, FinishData, InstanceData, LightData
 from warp_reflect.stage.cameras import read_camera
+from warp_reflect.stage.finish import FINISH_API, read_finish
 from warp_reflect.stage.instancer import expand, read_instancer
 from warp_reflect.stage.intake import BadPrim, Intake, column_matrix, library_message
 from warp_reflect.stage.lights import read_light
@@ -37,6 +38,7 @@ class Walk:
         drawn: The prims that are drawn, each once; what `below` returns has its index here as `mesh`, and no
             materials yet.
         lights, cameras, environment_maps: What was met of them; mirrors are added to `choices`.
+        finishes: By the path of the prim that asks for them.
     """
 
     stage: Usd.Stage
@@ -49,6 +51,7 @@ class Walk:
     lights: list[LightData] = field(default_factory=list)
     cameras: list[CameraData] = field(default_factory=list)
     environment_maps: list[EnvironmentMapData] = field(default_factory=list)
+    finishes: dict[str, FinishData] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._drawn_index: dict[str, int] = {}
@@ -129,6 +132,10 @@ class Walk:
             choice = read_mirror(prim, self.intake, self.choices.collections)
             if choice is not None:
                 self.choices.prims[choice.mirror.path] = choice
+        if FINISH_API in schemas:
+            finish = read_finish(prim, self.intake)
+            if finish is not None:
+                self.finishes[finish.path] = finish
         if ENVIRONMENT_MAP_API in schemas and state.visible and not state.inside_instancer:
             self._environment_map(prim, state)
         if prim.IsModel():
