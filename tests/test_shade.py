@@ -5,7 +5,7 @@ import pytest
 import trimesh
 import warp as wp
 
-from warp_reflect import raster, shade, surface
+from warp_reflect import raster, shade, shadows, surface
 from warp_reflect.layers import Camera, ReflectionLayer
 from warp_reflect.scene import (
     InstanceData,
@@ -487,7 +487,7 @@ def test_a_shape_light_alone_brings_no_default_sky():
     assert not rgba[:, :3].any()  # it shines upwards, away from the ground
 
 
-def shadowed_ground(shadows):
+def shadowed_ground(on):
     """Ground under a slanted sun with a square card one unit above it: (rgb, points [n, 3] of the ground or NaN)."""
     card = ground(0.5)
     sun = distant((np.pi, np.pi, np.pi), (1.0, 2.0, 0.0))
@@ -495,7 +495,7 @@ def shadowed_ground(shadows):
     camera = look_at((0.0, 6.0, 6.0), (0, 0, 0), fov=40.0)
     gbuffer = raster.draw_scene(scene, camera)
     _, gbuffer.reflector_id = surface.mirror_pixels(scene, gbuffer, {})
-    picture = shade.shade(scene, gbuffer, {}, shadows=shadows)[0].numpy()
+    picture = shade.shade(scene, gbuffer, {}, shadows=shadows.every_shadow(scene) if on else None)[0].numpy()
     d = eye_rays(camera)
     p = camera.eye - (camera.eye[1] / d[:, 1])[:, None] * d
     return picture[:, 0], np.where((gbuffer.triangle.numpy() < 2)[:, None], p, np.nan)
@@ -527,7 +527,8 @@ def test_shadows_are_seen_in_mirrors():
     gbuffer = raster.draw_scene(scene, camera)
     pixels, gbuffer.reflector_id = surface.mirror_pixels(scene, gbuffer, {1: 2})
     layer = raytraced.reflect(scene, raytraced.Prepared(2, False), gbuffer, pixels[1], camera, Settings())
-    mirror = [shade.shade(scene, gbuffer, {1: layer}, shadows=on)[1].numpy()[:, 0] for on in (False, True)]
+    cast = shadows.every_shadow(scene)
+    mirror = [shade.shade(scene, gbuffer, {1: layer}, shadows=on)[1].numpy()[:, 0] for on in (None, cast)]
     index = pixels[1].pixel.numpy()
     on_ground = layer.triangle.numpy() // 2 == 0
     p = layer.pixels.point.numpy() + layer.distance.numpy()[:, None] * layer.pixels.direction.numpy() + scene.origin

@@ -451,8 +451,7 @@ def direct_picture(
     Args:
         made: From `convert`, with a vectorised variant set.
         samples: Light samples a pixel.
-        shadows: Of which lights surfaces cast shadows: `none`, `distant` (those alone) or `all`, the environment
-            included.
+        shadows: Of which lights surfaces cast shadows: `none`, `lights` (all but the environment) or `all`.
         centred: Eye rays through the pixels' centres instead of all over them.
         seed: Of the samples.
 
@@ -567,7 +566,8 @@ def _radiance(geometry, lights, tables, sampler, ray, shadows: str, active, leve
         seen = hit & (sample.pdf > 0.0) & (facing > 0.0)
         flags = light.flags()
         distant = mi.has_flag(flags, mi.EmitterFlags.DeltaDirection)
-        if shadows == "all" or (shadows == "distant" and distant):
+        around = mi.has_flag(flags, mi.EmitterFlags.Infinite) and not distant
+        if shadows == "all" or (shadows == "lights" and not around):
             shadow = si.spawn_ray(sample.d)
             if not (distant or mi.has_flag(flags, mi.EmitterFlags.Infinite)):
                 shadow.maxt = sample.dist * (1.0 - NEAREST_HIT)

@@ -36,7 +36,8 @@ import warp as wp
 sys.path.insert(0, str(Path(__file__).parent))
 from bench_frames import Embree, commit, machine
 
-LIGHTING = ("none", "distant", "all")  # which lights' shadows Mitsuba casts
+SHADOW_SAMPLES = 64
+LIGHTING = ("none", "lights", "all")  # which lights' shadows Mitsuba casts
 ENVIRONMENT_SIDE = 512  # pixels of a face of VTK's environment
 CONVERGED = 128  # samples a pixel of the pictures that others are measured against
 LLVM = "llvm_ad_rgb"
@@ -49,7 +50,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--compare", action="store_true", help="judge the pictures instead of timing")
     parser.add_argument("--size", default="480x270", help="WxH")
     parser.add_argument("--samples", type=int, default=64, help="light samples a pixel of the judging picture")
-    parser.add_argument("--shadows", default="none,distant,all", help=f"some of {','.join(LIGHTING)}, for --compare")
+    parser.add_argument("--shadows", default="none,lights,all", help=f"some of {','.join(LIGHTING)}, for --compare")
     parser.add_argument("--rounds", type=int, default=5, help="timed rounds, after one for warm-up")
     parser.add_argument("--peer-samples", type=int, default=4, help="samples a pixel of Mitsuba's timed pictures")
     parser.add_argument("--threads", type=int, default=1)
@@ -123,7 +124,7 @@ def judge(stage: str, size: tuple[int, int], arguments, _llvm: bool) -> list[dic
     made = mitsuba_scene.convert(scene.data, scene.data.cameras[0], size, mirrors)
     rows = []
     for shadows in arguments.shadows.split(","):
-        settings = wr.Settings(shadows=shadows != "none")
+        settings = wr.Settings(shadows=shadows != "none", dome_shadows=shadows == "all", shadow_samples=SHADOW_SAMPLES)
         frame = wr.render_frame(scene, wr.make_plan(scene, size=size, settings=settings, method="reference"))
         ours = picture(frame)
         plain = frame["reflectorId"] == 0

@@ -35,7 +35,7 @@ def _toy_room(w: Writer) -> None:
     bowl = w.mesh("/World/Paraboloid", shape, "Chrome", digits=MIRROR_DIGITS)
     w.transform(bowl, (0.5, 0.2 + gap, 0.4))
     w.camera((0.05, 1.4, 2.25), (0.0, 0.7, 0.0), 43)
-    w.lights(sun_rotate=(-50, 24, 0))
+    w.room_lights(2.0, 0.08)
 
 
 HALL_WIDTH, HALL_LENGTH, HALL_HEIGHT = 3.6, 12.0, 2.6  # half of the width is the radius of the vault [m]
@@ -186,7 +186,7 @@ def _shaving_mirror(w: Writer) -> None:
     ):
         w.part(f"/World/Balloons/B{k}", "balloon", (x, 1.25 + 0.08 * k, z), (0, 0, 4 * k - 6), look=look)
     w.camera((0.0, 1.43, 0.78), (0.0, 1.03, -0.1), 30)
-    w.lights()
+    w.room_lights(2.2, 0.08)
 
 
 def _torus(w: Writer) -> None:
@@ -210,7 +210,7 @@ def _torus(w: Writer) -> None:
     for k, (x, z, y, look) in enumerate(BALLOONS[:12]):
         w.part(f"/World/Balloons/B{k:02d}", "balloon", (1.7 * x, y + 0.9, 1.6 * z), (0, 0, 3 * (k % 5) - 6), 1.5, look)
     w.camera((0.5, 2.3, 4.6), (0, 1.05, 0), 34)
-    w.lights()
+    w.room_lights(4.6, 0.16)
 
 
 SHOWROOM_FLOOR = ((0.62, 0.6, 0.57), (0.5, 0.48, 0.46))
@@ -267,7 +267,7 @@ def _car_body(w: Writer) -> None:
     for k, (name, x, z, turn, size, look) in enumerate(things):
         w.part(f"/World/Things/T{k}", name, (x, 0, z), (0, turn, 0), size, look)
     w.camera((4.05, 1.8, 5.2), (0.05, 0.6, 0.1), 25.5)
-    w.lights(sun_rotate=(-55, 40, 0))
+    w.room_lights(3.8, 0.3)
 
 
 CURVED_SCENES = {

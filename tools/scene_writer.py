@@ -184,6 +184,13 @@ class Writer:
         light.CreateNormalizeAttr(True)
         UsdGeom.Xformable(light).AddRotateXYZOp().Set(Gf.Vec3f(*map(float, sun_rotate)))
 
+    def room_lights(self, height: float, radius: float, irradiance: float = 2.2, dome=(0.62, 0.7, 0.82)) -> None:
+        """A constant dome, and below a ceiling that no sun falls through a ball that gives the floor this irradiance."""
+        light = UsdLux.DomeLight.Define(self.stage, "/World/Dome")
+        light.CreateColorAttr(Gf.Vec3f(*dome))
+        light.CreateIntensityAttr(0.75)
+        self.lamp("/World/Lamp", (0, height, 0), radius, round(irradiance / math.pi * (height / radius) ** 2, 2))
+
 
 def define_material(stage: Usd.Stage, path: Sdf.Path, look: Look) -> UsdShade.Material:
     material = UsdShade.Material.Define(stage, path)

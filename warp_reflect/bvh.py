@@ -438,33 +438,6 @@ def trace_onward_kernel(
     out_status[i] = wp.uint8(hit.status)
 
 
-@wp.kernel
-def trace_shadows_kernel(
-    first: int,
-    mesh_id: wp.uint64,
-    scene: SceneView,
-    triangle: wp.array(dtype=int),
-    u: wp.array(dtype=float),
-    v: wp.array(dtype=float),
-    towards: wp.array(dtype=wp.vec3),
-    out_lit: wp.array(dtype=wp.uint8),
-):
-    """One thread per point."""
-    i = first + wp.tid()
-    tri = triangle[i]
-    if tri < 0:
-        return
-    corner = scene.triangles[tri]
-    w = 1.0 - u[i] - v[i]
-    p = w * scene.points[corner[0]] + u[i] * scene.points[corner[1]] + v[i] * scene.points[corner[2]]
-    facet = scene_facet_normal(scene, tri)
-    count = towards.shape[0]
-    for k in range(count):
-        side = wp.where(wp.dot(facet, towards[k]) < 0.0, -1.0, 1.0)
-        hit = trace_ray(mesh_id, scene, p, towards[k], side * facet, tri, OwnBody(), 0)
-        out_lit[i * count + k] = wp.uint8(wp.where(hit.triangle < 0, 1, 0))
-
-
 class Tracer:
     """Owner of the triangle BVH of a scene, of one of its parts alone, or of those triangles that a mirror may show.
 
@@ -632,28 +605,3 @@ def own_obstacles(scene: Scene, gbuffer: GBuffer, pixels: MirrorPixels, part: in
     inputs = [wp.uint64(scene.part_tracer(part).id), scene.view, *rays, body, blocked]
     launch.launch(own_obstacles_kernel, pixels.count, inputs, scene.device, threads, split_min=TRACE_SPLIT_MIN)
     return blocked
-
-
-def trace_shadows(
-    scene: Scene, triangle: wp.array, u: wp.array, v: wp.array, towards: wp.array, threads: int = 0
-) -> wp.array:
-    """Which points on triangles see out of the scene along given directions.
-
-    Points are on the facets themselves: near the terminator of a coarse mesh its facets show.
-
-    Args:
-        scene: Its BVH is built if this is the first use.
-        triangle: int32 [n]; -1: no point.
-        u: float32 [n], weight of the second corner.
-        v: float32 [n], weight of the third corner.
-        towards: vec3 [k], unit, world axes.
-        threads: CPU threads; 0: one per core.
-
-    Returns:
-        uint8 [n * k], point by point: 1 where nothing is in the way, 0 elsewhere and where there is no point.
-    """
-    lit = wp.zeros(len(triangle) * len(towards), dtype=wp.uint8, device=scene.device)
-    if scene.tracer.id:
-        inputs = [wp.uint64(scene.tracer.id), scene.view, triangle, u, v, towards, lit]
-        launch.launch(trace_shadows_kernel, len(triangle), inputs, scene.device, threads, split_min=TRACE_SPLIT_MIN)
-    return lit

@@ -1,17 +1,18 @@
-"""Light that comes straight from distant lights and from shapes: irradiance per pixel, with or without shadows.
+"""Light that comes straight from distant lights and from shapes: irradiance per pixel, unshadowed (`shadows.py` asks rays).
 
-Only scenes with shapes that emit, and frames with shadows, pay for it. Shapes do not cast shadows, and are seen
-themselves neither directly nor in mirrors. Their irradiance is exact for rects (Lambert's formula) and for spheres;
-a disk is a regular polygon of its area, a cylinder the rectangle that it shows to the point (off by about its radius
-over the distance).
+Only scenes with shapes that emit, and frames with shadows, pay for it. Shapes are seen themselves neither directly nor in
+mirrors. Their irradiance is exact for rects (Lambert's formula) and for spheres; a disk is a regular polygon of its area,
+a cylinder the rectangle that it shows to the point (off by about its radius over the distance).
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import warp as wp
 
-from warp_reflect import bvh, launch
+from warp_reflect import launch
 from warp_reflect.layers import CameraView, GBuffer, ReflectionLayer, eye_ray_direction, eye_ray_origin
 from warp_reflect.scene import LightData, Scene, SceneView
 from warp_reflect.shapes import clamp_weights, intersect_triangle, unit
@@ -55,6 +56,27 @@ class AreaView:
 class DirectView:
     distant: wp.array(dtype=DistantView)
     areas: wp.array(dtype=AreaView)
+
+
+@dataclass(frozen=True)
+class Points:
+    """Points on triangles that are seen: by the eye at every pixel of an image, or by a mirror at some of them.
+
+    Attributes:
+        triangle: int32 [n], -1 where nothing is seen.
+        u, v: float32 [n], weights of the second and third corner.
+        direction: vec3 [n], unit, of the ray that sees it.
+        pixel: int32 [n], which pixel of the image; length 0: all of them in order.
+        width, height: Of the image. [pixels]
+    """
+
+    triangle: wp.array
+    u: wp.array
+    v: wp.array
+    direction: wp.array
+    pixel: wp.array
+    width: int
+    height: int
 
 
 def prepare_direct(lights: list[LightData], origin: np.ndarray, device) -> DirectView:
@@ -191,23 +213,28 @@ def sphere_irradiance(area: AreaView, p: wp.vec3, n: wp.vec3) -> float:
 
 
 @wp.func
-def area_irradiance(area: AreaView, p: wp.vec3, n: wp.vec3) -> float:
-    """Irradiance at p on a surface of unit normal n of a shape of radiance 1, unshadowed."""
-    if area.kind == SPHERE:
-        return sphere_irradiance(area, p, n)
+def shown_area(area: AreaView, p: wp.vec3) -> AreaView:
+    """The polygon that stands for a shape seen from p; a sphere stays what it is."""
     shown = area
     if area.kind == CYLINDER:
-        to_axis = area.centre - p
-        across = unit(wp.cross(area.x, to_axis))
+        across = unit(wp.cross(area.x, area.centre - p))
         shown = AreaView()
         shown.kind = POLYGON
         shown.sides = 4
         shown.centre = area.centre
         shown.x = wp.sqrt(2.0) * area.x
         shown.y = wp.sqrt(2.0) * area.radius * across
-    elif wp.dot(p - area.centre, area.out) <= 0.0:
+    return shown
+
+
+@wp.func
+def area_irradiance(area: AreaView, p: wp.vec3, n: wp.vec3) -> float:
+    """Irradiance at p on a surface of unit normal n of a shape of radiance 1, unshadowed."""
+    if area.kind == SPHERE:
+        return sphere_irradiance(area, p, n)
+    if area.kind == POLYGON and wp.dot(p - area.centre, area.out) <= 0.0:
         return 0.0
-    return polygon_irradiance(shown, p, n)
+    return polygon_irradiance(shown_area(area, p), p, n)
 
 
 @wp.kernel
@@ -253,7 +280,6 @@ def direct_kernel(
     u: wp.array(dtype=float),
     v: wp.array(dtype=float),
     direction: wp.array(dtype=wp.vec3),
-    lit: wp.array(dtype=wp.uint8),
     normals: wp.array(dtype=wp.vec3),
     out_irradiance: wp.array(dtype=wp.vec3),
 ):
@@ -269,63 +295,46 @@ def direct_kernel(
     if wp.dot(n, direction[i]) > 0.0:
         n = -n
     total = wp.vec3(0.0, 0.0, 0.0)
-    count = lights.distant.shape[0]
-    for k in range(count):
-        cosine = wp.dot(n, lights.distant[k].to_light)
-        if cosine > 0.0:
-            seen = int(1)
-            if lit.shape[0] > 0:
-                seen = int(lit[i * count + k])
-            if seen != 0:
-                total += cosine * lights.distant[k].irradiance
+    for k in range(lights.distant.shape[0]):
+        total += wp.max(wp.dot(n, lights.distant[k].to_light), 0.0) * lights.distant[k].irradiance
     for k in range(lights.areas.shape[0]):
         total += area_irradiance(lights.areas[k], p, n) * lights.areas[k].radiance
     out_irradiance[i] = total
 
 
+def points_of(scene: Scene, gbuffer: GBuffer, layer: ReflectionLayer | None = None, threads: int = 0) -> Points:
+    """What a frame shows: the eye's picture, or what is seen in a mirror."""
+    device, size = scene.device, gbuffer.camera.size
+    if layer is not None:
+        pixels = layer.pixels
+        return Points(layer.triangle, layer.u, layer.v, pixels.direction, pixels.pixel, *size)
+    triangle = gbuffer.triangle
+    direction = wp.zeros(len(triangle), dtype=wp.vec3, device=device)
+    u, v = (wp.zeros(len(triangle), dtype=float, device=device) for _ in range(2))
+    inputs = [scene.view, gbuffer.view, triangle, direction, u, v]
+    launch.launch(eye_weights_kernel, len(triangle), inputs, device, threads)
+    return Points(triangle, u, v, direction, wp.zeros(0, dtype=int, device=device), *size)
+
+
 def direct_irradiance(
-    scene: Scene,
-    lights: DirectView,
-    gbuffer: GBuffer,
-    layer: ReflectionLayer | None = None,
-    shadows: bool = False,
-    threads: int = 0,
-    normals: wp.array | None = None,
+    scene: Scene, lights: DirectView, points: Points, threads: int = 0, normals: wp.array | None = None
 ) -> wp.array:
-    """Irradiance of distant lights and shapes at what a frame shows, on the viewer's side.
+    """Unshadowed irradiance of distant lights and shapes at points, on the viewer's side.
 
     Args:
-        scene: On the G-buffer's device.
+        scene: Holds the triangles.
         lights: From `prepare_direct`.
-        gbuffer: What the eye sees.
-        layer: What is seen in a mirror; None: of what the eye sees itself.
-        shadows: Send rays towards the distant lights; those of shapes are never shadowed.
+        points: What is seen.
         threads: CPU threads; 0: one per core.
         normals: From `normal_maps.prepare_normals`; None: no normal maps.
 
     Returns:
-        vec3 [pixels of the G-buffer or of the layer], 0 where nothing is seen; length 0 where there are neither shapes
-        nor shadows: the distant lights alone are summed where they are used.
+        vec3 [points], 0 where nothing is seen.
     """
     device = scene.device
-    shadows = shadows and lights.distant.shape[0] > 0
-    if lights.areas.shape[0] == 0 and not shadows:
-        return wp.zeros(0, dtype=wp.vec3, device=device)
-    if layer is None:
-        triangle = gbuffer.triangle
-        direction = wp.zeros(len(triangle), dtype=wp.vec3, device=device)
-        u, v = (wp.zeros(len(triangle), dtype=float, device=device) for _ in range(2))
-        inputs = [scene.view, gbuffer.view, triangle, direction, u, v]
-        launch.launch(eye_weights_kernel, len(triangle), inputs, device, threads)
-    else:
-        triangle, u, v, direction = layer.triangle, layer.u, layer.v, layer.pixels.direction
-    lit = wp.zeros(0, dtype=wp.uint8, device=device)
-    if shadows:
-        towards = wp.array([view.to_light for view in lights.distant.list()], dtype=wp.vec3, device=device)
-        lit = bvh.trace_shadows(scene, triangle, u, v, towards, threads)
-    result = wp.zeros(len(triangle), dtype=wp.vec3, device=device)
+    result = wp.zeros(len(points.triangle), dtype=wp.vec3, device=device)
     if normals is None:
         normals = wp.zeros(0, dtype=wp.vec3, device=device)
-    inputs = [scene.view, lights, triangle, u, v, direction, lit, normals, result]
-    launch.launch(direct_kernel, len(triangle), inputs, device, threads)
+    inputs = [scene.view, lights, points.triangle, points.u, points.v, points.direction, normals, result]
+    launch.launch(direct_kernel, len(points.triangle), inputs, device, threads)
     return result

@@ -22,6 +22,7 @@ from warp_reflect.layers import Camera, CameraView, GBuffer, MirrorPixels, Refle
 from warp_reflect.scene import Scene, SceneView
 from warp_reflect.settings import Technique
 from warp_reflect.shade import LightView, dome_radiance
+from warp_reflect.shadows import Shadows
 from warp_reflect.shapes import clamp_weights, intersect_triangle, unit
 
 wp.set_module_options({"enable_backward": False})
@@ -372,7 +373,7 @@ def render_maps(
     without: Sequence[Collection[int]] = (),
     onward: Onward | None = None,
     levels: bool = False,
-    shadows: bool = False,
+    shadows: Shadows | None = None,
     threads: int = 0,
 ) -> CubeMaps:
     """Draw the cube maps of a scene at many places in one go.
@@ -385,7 +386,7 @@ def render_maps(
         without: Per map the parts that it leaves out, indices into `scene.parts`; empty: every map shows all.
         onward: Gives mirrors in the maps what they show; None: the domes.
         levels: Coarser levels for blurred look-ups, a third more memory.
-        shadows: Distant lights cast shadows.
+        shadows: Which lights cast shadows; None: none.
         threads: CPU threads; 0: one per core.
 
     Raises:

@@ -245,7 +245,7 @@ def render_frame(scene: Scene, plan: Plan, camera: str | Camera | None = None, p
         picture, transmitted = previous._picture, previous.transmitted
     else:
         with timer("shade"):
-            picture = shade.shade(scene, gbuffer, layers, settings.threads, settings.shadows, finish)
+            picture = shade.shade(scene, gbuffer, layers, settings.threads, plan.shadows, finish)
         transmitted = {}
         if behind is not None:
             with timer("transmission"):
@@ -307,7 +307,7 @@ def _behind(scene: Scene, plan: Plan) -> Behind | None:
     interfaces = transmission.interface_views(scene)
 
     def behind(gbuffer: GBuffer, layer: ReflectionLayer, seen: wp.array) -> wp.array:
-        return transmission.behind(scene, gbuffer, interfaces, layer, seen, plan.settings)
+        return transmission.behind(scene, gbuffer, interfaces, layer, seen, plan.settings, plan.shadows)
 
     return behind
 
@@ -320,7 +320,7 @@ def _look_through(
     parts = {pane.part for pane in plan.panes}
     shown = transmission.look_through(scene, gbuffer, transmission.interface_views(scene), parts, plan.settings)
     for found in shown.values():
-        seen = shade.seen_radiance(scene, gbuffer, found.layer, threads, plan.settings.shadows)
+        seen = shade.seen_radiance(scene, gbuffer, found.layer, threads, plan.shadows)
         transmission.add_to_picture(picture[0], found, behind(gbuffer, found.layer, seen), threads)
     return shown
 

@@ -6,17 +6,18 @@ import dataclasses
 import difflib
 from dataclasses import dataclass, field
 
-import numpy as np
-
 from warp_reflect import __version__, applicable, choice, raster, transmission
 from warp_reflect.applicable import PREFERRED
 from warp_reflect.budget import BUILT_IN, Costs, fixed_ms, predict
 from warp_reflect.effects import Effect, finish_effects, pane_effects
 from warp_reflect.launch import thread_count
 from warp_reflect.layers import Camera, Reflector
+from warp_reflect.lighting import LightRow, needs_probe, plan_lights, shadows_of
+from warp_reflect.probe import Probe, preview, probe
 from warp_reflect.reflectors import mirror_weight
 from warp_reflect.scene import Note, PartRange, Scene
 from warp_reflect.settings import Settings
+from warp_reflect.shadows import Shadows
 from warp_reflect.techniques import MAPS, TECHNIQUES
 
 METHODS = ("auto", "reference", "none")
@@ -73,6 +74,7 @@ class Plan:
         rows: One `PlanRow` per reflector, in the order of their ids.
         panes: One `PaneRow` per transparent surface, in the order of their parts.
         notes: What the user should know about the plan, beside the scene's own notes.
+        lights: One `LightRow` per light of the stage.
         costs: What the machine's steps cost.
         pace: Milliseconds that took place for one that was predicted, learnt where a time is asked for.
     """
@@ -84,6 +86,7 @@ class Plan:
     rows: list[PlanRow]
     panes: list[PaneRow]
     notes: list[Note]
+    lights: list[LightRow] = field(default_factory=list)
     costs: Costs = BUILT_IN
     pace: float = 1.0
     _prepared: dict[int, object] = field(default_factory=dict)
@@ -95,7 +98,13 @@ class Plan:
         width, height = self.size
         seen = sum(row.pixels for row in self.rows)
         threads = thread_count(self.scene.device, self.settings.threads)
-        return fixed_ms(self.scene.triangle_count, width * height, seen, self.costs, threads)
+        shadows = sum(row.effects["shadows"].numbers.get("ms", 0.0) for row in self.lights if row.effects["shadows"].on)
+        return fixed_ms(self.scene.triangle_count, width * height, seen, self.costs, threads) + shadows
+
+    @property
+    def shadows(self) -> Shadows | None:
+        """Which lights cast shadows; None: none does."""
+        return shadows_of(self.lights, self.settings)
 
     @property
     def predicted(self) -> dict[str, float]:
@@ -164,6 +173,7 @@ class Plan:
                 }
                 for pane in self.panes
             ],
+            "lights": [dataclasses.asdict(row) for row in self.lights],
             "notes": [{"path": note.path, "text": note.text} for note in [*self.scene.notes, *self.notes]],
         }
 
@@ -176,7 +186,8 @@ class Plan:
             panes += [f"    {'on ' if each.on else 'off'} {name}: {each.reason}" for name, each in pane.effects.items()]
         if not self.rows:
             none = "no reflector: nothing is simulated beyond the direct picture"
-            return "\n".join([*lines, none.replace("beyond", "in mirrors beyond") if panes else none, *panes])
+            lines.append(none.replace("beyond", "in mirrors beyond") if panes else none)
+            return "\n".join([*lines, *panes, *self._light_lines()])
         names = [row.name for row in self.rows]
         column = max(len("mirror"), *map(len, names))
         technique = max(len("technique"), *(len(row.technique) + 7 * row.forced for row in self.rows))
@@ -191,11 +202,18 @@ class Plan:
             lines.append(f"{row.reflector.id:3d} {name:{column}}  {chosen:{technique}}  {row.pixels:9,d}  {numbers}")
             lines.append(f"    {row.reason}")
             lines += [f"    {'on ' if each.on else 'off'} {name}: {each.reason}" for name, each in row.effects.items()]
-        lines += panes
+        lines += [*panes, *self._light_lines()]
         whole = self.predicted
         times = f"{whole['ms']:.3g} ms, {whole['first_ms']:.3g} ms from nothing"
         lines.append(f"a frame: {times}, {whole['error_px']:.2g} px (predicted)")
         return "\n".join(lines)
+
+    def _light_lines(self) -> list[str]:
+        lines = []
+        for row in self.lights:
+            lines.append(f"    {row.path}: {row.kind} light")
+            lines += [f"    {'on ' if each.on else 'off'} {name}: {each.reason}" for name, each in row.effects.items()]
+        return lines
 
 
 def _name(row: PlanRow | PaneRow) -> str:
@@ -272,9 +290,13 @@ def make_plan(
         if asked and (weight := mirror_weight(scene, part, settings))
     ]
     clear = [k for k, part in enumerate(scene.parts) if transmission.is_transparent(scene, part)]
-    pixels = _pixel_counts(scene, view, [*(k for k, _, _ in found), *clear], settings)
+    pixels, tried = _look(scene, view, [k for k, _, _ in found], clear, settings)
+    lights = plan_lights(scene, tried, settings)
+    # What techniques draw themselves is shadowed where the picture is.
+    cast = shadows_of(lights, settings)
+    drawn = settings.replace(shadows=cast is not None and cast.direct)
     rows = [
-        _row(scene, view, settings, method, number, part_index, part, weight, pixels[part_index], notes, costs)
+        _row(scene, view, drawn, method, number, part_index, part, weight, pixels[part_index], notes, costs, lights)
         for number, (part_index, part, weight) in enumerate(found, 1)
     ]
     panes = [_pane(scene, settings, k, pixels[k]) for k in clear]
@@ -283,7 +305,7 @@ def make_plan(
         notes.append(
             Note(path, "texture of normal: a mirror reflects at the surface itself; its normal map is not used")
         )
-    made = Plan(scene, view, settings, method, rows, panes, notes, costs)
+    made = Plan(scene, view, settings, method, rows, panes, notes, lights, costs)
     _fit(made, 1.0 if earlier is None else earlier.pace)
     _take_over(made, earlier)
     return made
@@ -344,30 +366,19 @@ def find_camera(scene: Scene, camera: str | Camera | None, size: tuple[int, int]
     return Camera.from_data((exact or matching)[0], (width, height))
 
 
-PREVIEW_SIDE = 320  # pixels; enough to count a mirror's pixels within a few per cent for the choice of technique
+def _look(
+    scene: Scene, camera: Camera, mirrors: list[int], panes: list[int], settings: Settings
+) -> tuple[dict[int, int], Probe | None]:
+    """(pixels that show each part, the points that lights are decided by or None where there is nothing to decide)."""
+    wanted = needs_probe(scene, settings)
+    if not scene.triangle_count or not (mirrors or panes or wanted):
+        return dict.fromkeys([*mirrors, *panes], 0), None
+    small = preview(scene, camera, settings.threads)
+    tried = probe(scene, small, mirrors, settings.threads) if wanted else None
+    return small.pixels_of(scene, [*mirrors, *panes]), tried
 
 
-def _pixel_counts(scene: Scene, camera: Camera, parts: list[int], settings: Settings) -> dict[int, int]:
-    """Pixels that show each part from the camera, counted in a small picture."""
-    if not parts or not scene.triangle_count:
-        return dict.fromkeys(parts, 0)
-    width, height = camera.size
-    shrink = max(1.0, max(width, height) / PREVIEW_SIDE)
-    small = dataclasses.replace(
-        camera,
-        size=(max(1, round(width / shrink)), max(1, round(height / shrink))),
-        fx=camera.fx / shrink,
-        fy=camera.fy / shrink,
-        cx=camera.cx / shrink,
-        cy=camera.cy / shrink,
-    )
-    triangle = raster.draw_scene(scene, small, settings.threads).triangle.numpy()
-    patches = np.bincount(scene.host_triangle_patch[triangle[triangle >= 0]], minlength=len(scene.patch_shapes))
-    scale = width * height / (small.size[0] * small.size[1])
-    return {k: round(float(patches[list(scene.parts[k].patches)].sum()) * scale) for k in parts}
-
-
-def _row(scene, camera, settings, method, number, part_index, part, weight, pixels, notes, costs) -> PlanRow:
+def _row(scene, camera, settings, method, number, part_index, part, weight, pixels, notes, costs, lights) -> PlanRow:
     looked_at = method != "auto" or pixels >= max(settings.few_pixels, 1)
     reflector = Reflector(number, part_index, looked_at and scene.body(part_index).convex)
     technique, forced, reason = _technique(scene, reflector, camera, method, pixels, settings, part, notes, costs)
@@ -382,7 +393,7 @@ def _row(scene, camera, settings, method, number, part_index, part, weight, pixe
         forced,
         reason,
         pixels,
-        _effects(scene, part, technique, pixels, weight, settings),
+        _effects(scene, part, technique, pixels, weight, settings) | {"shadows": _shadows(lights, pixels > 0)},
         settings,
         _predicted(scene, reflector, camera, technique, pixels, settings, costs),
     )
@@ -556,7 +567,14 @@ def _effects(scene, part, technique, pixels, weight, settings) -> dict[str, Effe
         "warm_start": Effect(
             visible and searched, "from the previous frame where one is given" if searched else no_search
         ),
-        "shadows": Effect(settings.shadows, f"shadows={settings.shadows}"),
         "second_bounce": Effect(False, "a mirror seen in a mirror shows its base and the dome, one level deep"),
         **finish_effects(scene, part, visible, settings),
     }
+
+
+def _shadows(lights: list[LightRow], visible: bool) -> Effect:
+    """Shadows among what a mirror shows: of the lights that cast them."""
+    casting = [row.path for row in lights if row.effects["shadows"].on]
+    if not casting:
+        return Effect(False, "no light casts shadows into view (see the lights)")
+    return Effect(visible, f"cast by {', '.join(casting)}" if visible else "not seen from the camera")

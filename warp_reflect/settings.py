@@ -60,6 +60,8 @@ SEARCHES = ("newton", "midpoint")
 GRID_KINDS = ("direction", "slope", "position")
 REFINEMENTS = ("exact", "strict", "off")
 OCCLUSIONS = ("exact", "painter")
+SWITCHED = ("shadows", "dome_shadows")  # settings that take a boolean for on and off
+SWITCHES = {"1": "on", "true": "on", "on": "on", "0": "off", "false": "off", "off": "off"}
 ENVIRONMENT_UPDATES = ("static", "frame", "previous")
 FIELDS = ("auto", "heightfield", "occupancy")
 
@@ -122,8 +124,14 @@ class Settings:
     """Transparent surfaces behind one another that are looked through; nothing is seen through the next."""
     threads: int = 0
     """CPU threads of a launch; 0: one per core."""
-    shadows: bool = False
-    """Shadow rays towards distant lights."""
+    shadows: str = "auto"
+    """Shadows of distant lights and of shapes that emit: `auto` (of those that cast them into view), `on` or `off`."""
+    shadow_min_share: float = 0.001
+    """`shadows=auto`: a light casts shadows where they take at least this share of all light off what is seen."""
+    shadow_samples: int = 16
+    """Rays from a point towards a shape, or into a dome; a penumbra's error falls with their 3/4th power."""
+    dome_shadows: str = "off"
+    """`on`: domes light a point only through what it sees of the sky, `shadow_samples` rays a point; or `off`."""
     field_kind: str = "auto"
     """What maps trace rays through: `heightfield`, `occupancy` (a 3-D grid), or `auto`, by `field_overhang`."""
     field_cell: float = 0.0
@@ -136,6 +144,12 @@ class Settings:
     """A material whose mirror weight at normal incidence is below this is not treated as a mirror."""
 
     def __post_init__(self) -> None:
+        for name in SWITCHED:
+            object.__setattr__(self, name, SWITCHES.get(str(getattr(self, name)).lower(), getattr(self, name)))
+        _require(self.shadows in ("auto", *SWITCHES.values()), "shadows", self.shadows, "auto, on or off")
+        _require(0.0 <= self.shadow_min_share <= 1.0, "shadow_min_share", self.shadow_min_share, "0 to 1")
+        _require(1 <= self.shadow_samples <= 65536, "shadow_samples", self.shadow_samples, "1 to 65536 rays")
+        _require(self.dome_shadows in SWITCHES.values(), "dome_shadows", self.dome_shadows, "on or off")
         _require(self.search in SEARCHES, "search", self.search, f"one of {', '.join(SEARCHES)}")
         _require(0.0 <= self.grid_share <= 1.0, "grid_share", self.grid_share, "0 to 1")
         _require(self.grid_kind in GRID_KINDS, "grid_kind", self.grid_kind, f"one of {', '.join(GRID_KINDS)}")

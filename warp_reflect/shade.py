@@ -2,8 +2,8 @@
 
 Approximates UsdPreviewSurface, textures included (`textures.py`):
 
-* base: Lambert under the dome's irradiance (its first nine spherical harmonics), the distant lights, which cast
-  shadows on demand, and the unshadowed shapes that emit (`direct.py`);
+* base: Lambert under the dome's irradiance (its first nine spherical harmonics), the distant lights and the shapes
+  that emit (`direct.py`), with the shadows asked for (`shadows.py`);
 * mirror term: Schlick's Fresnel between F0 and F90 at the angle of incidence, and the white clear coat on top
   of it, times the radiance from the reflected direction. At a reflector that is the surface its layer names;
   elsewhere, and for a mirror seen in a mirror, the dome;
@@ -27,10 +27,11 @@ import numpy as np
 import warp as wp
 
 from warp_reflect import launch
-from warp_reflect.direct import AREA_KINDS, DirectView, direct_irradiance, prepare_direct
+from warp_reflect.direct import AREA_KINDS, DirectView, direct_irradiance, points_of, prepare_direct
 from warp_reflect.layers import CameraView, GBuffer, ReflectionLayer, eye_ray_direction, eye_ray_origin
 from warp_reflect.normal_maps import prepare_normals
 from warp_reflect.scene import SHAPE_QUADRIC, Scene, SceneView
+from warp_reflect.shadows import Shadows, shadowed_irradiance, sky_share
 from warp_reflect.shapes import clamp_weights, intersect_triangle, unit
 from warp_reflect.surface import hit_normal, shown_normal
 from warp_reflect.textures import Look, plain_look, prepare_looks
@@ -238,13 +239,35 @@ def dome_irradiance(lights: LightView, n: wp.vec3) -> wp.vec3:
     return total
 
 
+@wp.kernel
+def dome_irradiance_kernel(
+    first: int, lights: LightView, normal: wp.array(dtype=wp.vec3), out_irradiance: wp.array(dtype=wp.vec3)
+):
+    """One thread per normal."""
+    i = first + wp.tid()
+    out_irradiance[i] = dome_irradiance(lights, normal[i])
+
+
+def dome_irradiances(scene: Scene, normal: np.ndarray, threads: int = 0) -> np.ndarray:
+    """Irradiance of a scene's domes on surfaces of unit normals [n, 3], float32 [n, 3]."""
+    normals = wp.array(np.ascontiguousarray(normal, np.float32), dtype=wp.vec3, device=scene.device)
+    result = wp.zeros(len(normals), dtype=wp.vec3, device=scene.device)
+    launch.launch(dome_irradiance_kernel, len(normals), [scene.lights, normals, result], scene.device, threads)
+    return result.numpy()
+
+
 @wp.func
-def irradiance_at(lights: LightView, direct: wp.array(dtype=wp.vec3), i: int, n: wp.vec3) -> wp.vec3:
+def irradiance_at(
+    lights: LightView, direct: wp.array(dtype=wp.vec3), sky: wp.array(dtype=float), i: int, n: wp.vec3
+) -> wp.vec3:
     """Irradiance of all lights on a surface of unit normal n; `direct` has point i's share of all but the domes.
 
-    Where `direct` is empty there are only domes and distant lights, without shadows.
+    Where `direct` is empty there are only domes and distant lights, without shadows. `sky` has the share of the domes
+    that reaches point i; empty: all.
     """
     total = dome_irradiance(lights, n)
+    if sky.shape[0] > 0:
+        total *= sky[i]
     if direct.shape[0] > 0:
         return total + direct[i]
     for k in range(lights.direct.distant.shape[0]):
@@ -340,6 +363,7 @@ def hit_radiance(
     looks: wp.array(dtype=Look),
     normals: wp.array(dtype=wp.vec3),
     direct: wp.array(dtype=wp.vec3),
+    sky: wp.array(dtype=float),
     i: int,
     triangle: int,
     u: float,
@@ -361,7 +385,7 @@ def hit_radiance(
             look = looks[i]
         else:
             look = plain_look(scene, triangle, u, v)
-        lobes = split_lobes(look, irradiance_at(lights, direct, i, n), wp.abs(cosine), False)
+        lobes = split_lobes(look, irradiance_at(lights, direct, sky, i, n), wp.abs(cosine), False)
         base = lobes.base
         weight = lobes.mirror
     if wp.max(weight) > 0.0:
@@ -378,6 +402,7 @@ def shade_kernel(
     looks: wp.array(dtype=Look),
     normals: wp.array(dtype=wp.vec3),
     direct: wp.array(dtype=wp.vec3),
+    sky: wp.array(dtype=float),
     triangle: wp.array(dtype=int),
     reflector_id: wp.array(dtype=int),
     # Outputs:
@@ -408,7 +433,7 @@ def shade_kernel(
             look = looks[i]
         else:
             look = plain_look(scene, tri, uv[0], uv[1])
-        lobes = split_lobes(look, irradiance_at(lights, direct, i, n), wp.abs(cosine), reflector)
+        lobes = split_lobes(look, irradiance_at(lights, direct, sky, i, n), wp.abs(cosine), reflector)
         base = lobes.base
         weight = lobes.mirror
         coverage = float(1.0)
@@ -429,6 +454,7 @@ def seen_radiance_kernel(
     looks: wp.array(dtype=Look),
     normals: wp.array(dtype=wp.vec3),
     direct: wp.array(dtype=wp.vec3),
+    sky: wp.array(dtype=float),
     direction: wp.array(dtype=wp.vec3),
     triangle: wp.array(dtype=int),
     u: wp.array(dtype=float),
@@ -437,7 +463,7 @@ def seen_radiance_kernel(
 ):
     """One thread per mirror pixel."""
     i = first + wp.tid()
-    out_radiance[i] = hit_radiance(scene, lights, looks, normals, direct, i, triangle[i], u[i], v[i], direction[i])
+    out_radiance[i] = hit_radiance(scene, lights, looks, normals, direct, sky, i, triangle[i], u[i], v[i], direction[i])
 
 
 @wp.kernel
@@ -457,8 +483,42 @@ def mirror_term_kernel(
     out_picture[p] += wp.vec4(term[0], term[1], term[2], 0.0)
 
 
+def arriving(
+    scene: Scene,
+    gbuffer: GBuffer,
+    layer: ReflectionLayer | None,
+    normals: wp.array,
+    threads: int = 0,
+    shadows: Shadows | None = None,
+) -> tuple[wp.array, wp.array]:
+    """The light that reaches what a frame shows, as far as it is not the same everywhere.
+
+    Args:
+        layer: What is seen in a mirror; None: of what the eye sees itself.
+        normals: From `normal_maps.prepare_normals`.
+        shadows: Which lights cast shadows; None: none.
+
+    Returns:
+        (irradiance of distant lights and shapes vec3 [n], length 0 where there are neither shapes nor shadows: the distant
+        lights alone are summed where they are used; share of the domes float32 [n], length 0: all of them).
+    """
+    direct = wp.zeros(0, dtype=wp.vec3, device=scene.device)
+    sky = wp.zeros(0, dtype=float, device=scene.device)
+    asked = shadows is not None and scene.triangle_count > 0
+    if not asked and len(scene.lights.direct.areas) == 0:
+        return direct, sky
+    points = points_of(scene, gbuffer, layer, threads)
+    if asked and shadows.direct:
+        direct = shadowed_irradiance(scene, points, shadows, threads, normals)
+    elif len(scene.lights.direct.areas) > 0:
+        direct = direct_irradiance(scene, scene.lights.direct, points, threads, normals)
+    if asked and shadows.domes:
+        sky = sky_share(scene, points, shadows.samples, threads, normals)
+    return direct, sky
+
+
 def seen_radiance(
-    scene: Scene, gbuffer: GBuffer, layer: ReflectionLayer, threads: int = 0, shadows: bool = False
+    scene: Scene, gbuffer: GBuffer, layer: ReflectionLayer, threads: int = 0, shadows: Shadows | None = None
 ) -> wp.array:
     """What a mirror's pixels see, before the mirror's own weight.
 
@@ -470,9 +530,9 @@ def seen_radiance(
     pixels = layer.pixels
     looks = prepare_looks(scene, gbuffer, layer, threads)
     normals = prepare_normals(scene, gbuffer, layer, threads)
-    direct = direct_irradiance(scene, scene.lights.direct, gbuffer, layer, shadows, threads, normals)
+    direct, sky = arriving(scene, gbuffer, layer, normals, threads, shadows)
     radiance = wp.empty(pixels.count, dtype=wp.vec3, device=scene.device)
-    inputs = [scene.view, scene.lights, looks, normals, direct, pixels.direction, layer.triangle, layer.u, layer.v]
+    inputs = [scene.view, scene.lights, looks, normals, direct, sky, pixels.direction, layer.triangle, layer.u, layer.v]
     launch.launch(seen_radiance_kernel, pixels.count, [*inputs, radiance], scene.device, threads)
     return radiance
 
@@ -482,7 +542,7 @@ def shade(
     gbuffer: GBuffer,
     layers: Mapping[int, ReflectionLayer],
     threads: int = 0,
-    shadows: bool = False,
+    shadows: Shadows | None = None,
     finish: Finish | None = None,
 ) -> tuple[wp.array, wp.array]:
     """The picture of a frame.
@@ -492,7 +552,7 @@ def shade(
         gbuffer: With its `reflector_id` set.
         layers: The answer of every reflector that `reflector_id` names.
         threads: CPU threads; 0: one per core.
-        shadows: Distant lights cast shadows, directly seen and in mirrors.
+        shadows: Which lights cast shadows, directly seen and in mirrors; None: none.
         finish: Turns what a sharp mirror's pixels see (vec3 [layer.pixels.count]) into what this mirror's do; None: all
             are sharp.
 
@@ -507,8 +567,8 @@ def shade(
     mirror = wp.empty(count, dtype=wp.vec3, device=device)
     looks = prepare_looks(scene, gbuffer, None, threads)
     normals = prepare_normals(scene, gbuffer, None, threads)
-    direct = direct_irradiance(scene, lights.direct, gbuffer, None, shadows, threads, normals)
-    inputs = [scene.view, gbuffer.view, lights, looks, normals, direct, gbuffer.triangle, gbuffer.reflector_id]
+    direct, sky = arriving(scene, gbuffer, None, normals, threads, shadows)
+    inputs = [scene.view, gbuffer.view, lights, looks, normals, direct, sky, gbuffer.triangle, gbuffer.reflector_id]
     inputs += [picture, mirror]
     launch.launch(shade_kernel, count, inputs, device, threads)
     for layer in layers.values():

@@ -32,6 +32,7 @@ from warp_reflect.normal_maps import prepare_normals
 from warp_reflect.optics import dielectric_reflectance, refract
 from warp_reflect.scene import SHAPE_NONE, PartRange, Scene, SceneView
 from warp_reflect.settings import Settings, Technique
+from warp_reflect.shadows import Shadows
 from warp_reflect.shapes import facet_normal, unit
 from warp_reflect.surface import hit_normal, polish, shown_normal, surface_at
 from warp_reflect.textures import Look, plain_look, prepare_looks
@@ -344,7 +345,13 @@ def look_through(
 
 
 def behind(
-    scene: Scene, gbuffer: GBuffer, interfaces: wp.array, layer: ReflectionLayer, seen: wp.array, settings: Settings
+    scene: Scene,
+    gbuffer: GBuffer,
+    interfaces: wp.array,
+    layer: ReflectionLayer,
+    seen: wp.array,
+    settings: Settings,
+    shadows: Shadows | None = None,
 ) -> wp.array:
     """What a layer's rays see, with all that is behind the transparent surfaces among it.
 
@@ -354,7 +361,8 @@ def behind(
         interfaces: From `interface_views`.
         layer: Rays and what they met.
         seen: vec3 [n], radiance of that; not written to.
-        settings: `transparency_depth`, threads, shadows.
+        settings: `transparency_depth`, threads.
+        shadows: Which lights cast shadows; None: none.
 
     Returns:
         vec3 [n]; `seen` itself where nothing is transparent. The layer's statistics get `onward`: rays followed, and
@@ -402,7 +410,7 @@ def behind(
         facet, inside = taken(layer.triangle), taken(inside)
         layer = ReflectionLayer.empty(pixels, Technique.RAYTRACED, device)
         bvh.trace_transmitted(scene, layer, facet, inside, threads)
-        seen = shade.seen_radiance(scene, gbuffer, layer, threads, settings.shadows)
+        seen = shade.seen_radiance(scene, gbuffer, layer, threads, shadows)
     return total
 
 

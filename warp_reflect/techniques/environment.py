@@ -20,6 +20,7 @@ from warp_reflect.environment_maps import CubeMaps, look_up, render_maps
 from warp_reflect.layers import Camera, GBuffer, MirrorPixels, ReflectionLayer
 from warp_reflect.scene import Scene
 from warp_reflect.settings import Settings, Status, Technique
+from warp_reflect.shadows import asked_shadows
 
 PREVIEW_SIDE = 160  # pixels of the picture in which parallax is predicted; its pixels' errors vary slowly
 QUANTILE = (
@@ -123,7 +124,7 @@ def _draw(scene: Scene, part: int, centre: np.ndarray, settings: Settings, befor
     else:
         onward = None
     resolution = settings.environment_resolution
-    options = {"onward": onward, "shadows": settings.shadows, "threads": settings.threads}
+    options = {"onward": onward, "shadows": asked_shadows(scene, settings), "threads": settings.threads}
     return render_maps(scene, centre[None], resolution, without=[left_out(scene, part)], **options), 0
 
 

@@ -18,6 +18,7 @@ from warp_reflect.reflectors import mirror_weight
 from warp_reflect.scene import Scene, SceneView
 from warp_reflect.settings import Settings
 from warp_reflect.shade import LightView, dome_radiance, split_lobes
+from warp_reflect.shadows import asked_shadows
 from warp_reflect.surface import hit_normal, shown_normal
 from warp_reflect.textures import Look, plain_look, prepare_looks
 
@@ -71,7 +72,7 @@ def of_depth(scene: Scene, settings: Settings, depth: int) -> Onward:
     """
     from warp_reflect.techniques.environment import centre_of, left_out
 
-    resolution, shadows = settings.environment_resolution, settings.shadows
+    resolution, shadows = settings.environment_resolution, asked_shadows(scene, settings)
     parts = tuple(k for k, part in enumerate(scene.parts) if mirror_weight(scene, part, settings))
     key = ("mirrors", parts, resolution, shadows, depth)
     if key not in scene.environments:

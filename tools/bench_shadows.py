@@ -1,0 +1,76 @@
+"""What the samples of a shape light's shadow cost and give: error beside time, against many samples.
+
+    python tools/bench_shadows.py usd_scenes/corridor.usda --size 640x360
+
+*Irradiance* is of all lights but the domes on what the eye sees directly; its error is the root mean square over the
+pixels in a penumbra (where the samples of the exact picture disagree), of the unshadowed irradiance there. Times are of
+one process, median of `--rounds`, CPU time of all threads; the domes' rows the same with `dome_shadows=on`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+import numpy as np
+
+import warp_reflect as wr
+from warp_reflect import devices, direct, raster, shadows
+
+EXACT = 1024  # samples; sixteen times the most that is measured
+SAMPLES = (1, 4, 16, 64)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("stage")
+    parser.add_argument("--size", default="640x360")
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--threads", type=int, default=0)
+    arguments = parser.parse_args()
+    width, height = (int(side) for side in arguments.size.split("x"))
+    devices.open_device("cpu")
+    scene = wr.load_stage(arguments.stage)
+    plan = wr.make_plan(scene, size=(width, height), settings=wr.Settings(shadows="off"))
+    gbuffer = raster.draw_scene(scene, plan.camera, arguments.threads)
+    points = direct.points_of(scene, gbuffer, None, arguments.threads)
+    seen = gbuffer.triangle.numpy() >= 0
+
+    def irradiance(samples: int) -> np.ndarray:
+        cast = shadows.every_shadow(scene, samples)
+        return shadows.shadowed_irradiance(scene, points, cast, arguments.threads).numpy()[seen].mean(axis=1)
+
+    def sky(samples: int) -> np.ndarray:
+        return shadows.sky_share(scene, points, samples, arguments.threads).numpy()[seen]
+
+    unshadowed = (
+        direct.direct_irradiance(scene, scene.lights.direct, points, arguments.threads).numpy()[seen].mean(axis=1)
+    )
+    print(f"{arguments.stage}  {width}x{height}, {seen.sum()} points")
+    if len(scene.lights.direct.areas):
+        exact = irradiance(EXACT)
+        part = (exact > 0.02 * unshadowed) & (exact < 0.98 * unshadowed)
+        print(f"lights: {part.mean():.1%} of the points partly shadowed")
+        report(irradiance, exact, part, unshadowed, arguments.rounds)
+    exact = sky(EXACT)
+    print("domes")
+    report(sky, exact, np.full(len(exact), True), np.ones(len(exact)), arguments.rounds)
+
+
+def report(answer, exact, part, whole, rounds: int) -> None:
+    """One line per number of samples: its error and its time."""
+    for samples in SAMPLES:
+        spent = []
+        for _ in range(rounds):
+            start = time.process_time()
+            got = answer(samples)
+            spent.append(time.process_time() - start)
+        error = ((got - exact) / np.maximum(whole, 1.0e-9))[part]
+        print(
+            f"  {samples:4d} samples: rms error {np.sqrt(np.mean(error**2)):.4f}, 95 % within "
+            f"{np.percentile(np.abs(error), 95):.4f}, CPU {1e3 * np.median(spent):.0f} ms"
+        )
+
+
+if __name__ == "__main__":
+    main()
