@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from warp_reflect.scene import PartRange, Scene
+from warp_reflect.scene import MaterialData, PartRange, Scene
 from warp_reflect.settings import Settings
 
 # The effects that are finishes, in the order in which they are applied, and the module of `finishes` of each.
-FINISHES: dict[str, str] = {}
+FINISHES = {"roughness": "glossy"}
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,8 @@ def finish_effects(scene: Scene, part: PartRange, visible: bool, settings: Setti
     """
     if not visible:
         return {name: Effect(False, "not seen from the camera") for name in FINISHES}
-    return {}
+    material = scene.data.materials[part.material]
+    return {"roughness": _roughness(material, settings)}
 
 
 def pane_effects(
@@ -53,3 +54,15 @@ def pane_effects(
         "transparency": Effect(True, f"opacity {material.opacity:g}, {seen}, {depth}", numbers),
         "refraction": Effect(interface == "solid", reason, {"ior": material.ior}),
     }
+
+
+def _roughness(material: MaterialData, settings: Settings) -> Effect:
+    if settings.glossy == "off":
+        return Effect(False, "glossy=off")
+    textured = "roughness" in material.textures
+    value = f"roughness {material.roughness:.3g}{' (mean of its texture)' if textured else ''}"
+    least = settings.glossy_min_roughness
+    numbers = {"roughness": material.roughness}
+    if not textured and material.roughness <= least:
+        return Effect(False, f"{value} <= {least:g} (glossy_min_roughness)", numbers)
+    return Effect(True, f"{value} > {least:g} (glossy_min_roughness), glossy={settings.glossy}", numbers)

@@ -333,8 +333,11 @@ def _finish(scene: Scene, plan: Plan, behind: Behind | None) -> shade.Finish | N
     rows = {row.reflector.id: row for row in plan.rows}
 
     def finish(shown: shade.Shown, layer: ReflectionLayer, sharp: wp.array) -> wp.array:
-        if behind is not None and layer.radiance is None:
-            sharp = behind(shown.gbuffer, layer, sharp)
+        if behind is not None:
+            direct = shown.seen
+            shown = dataclasses.replace(shown, seen=lambda layer: behind(shown.gbuffer, layer, direct(layer)))
+            if layer.radiance is None:
+                sharp = behind(shown.gbuffer, layer, sharp)
         radiance, reflector = sharp, layer.pixels.reflector
         for name in planned[reflector]:
             module = importlib.import_module(f"warp_reflect.finishes.{FINISHES[name]}")

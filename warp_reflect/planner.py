@@ -14,7 +14,7 @@ from warp_reflect.launch import thread_count
 from warp_reflect.layers import Camera, Reflector
 from warp_reflect.lighting import LightRow, needs_probe, plan_lights, shadows_of
 from warp_reflect.probe import Probe, preview, probe
-from warp_reflect.reflectors import mirror_weight
+from warp_reflect.reflectors import mirror_roughness, mirror_weight
 from warp_reflect.scene import Note, PartRange, Scene
 from warp_reflect.settings import Settings
 from warp_reflect.shadows import Shadows
@@ -305,10 +305,24 @@ def make_plan(
         notes.append(
             Note(path, "texture of normal: a mirror reflects at the surface itself; its normal map is not used")
         )
+    notes += _too_rough(scene, settings)
     made = Plan(scene, view, settings, method, rows, panes, notes, lights, costs)
     _fit(made, 1.0 if earlier is None else earlier.pace)
     _take_over(made, earlier)
     return made
+
+
+def _too_rough(scene: Scene, settings: Settings) -> list[Note]:
+    """A note for each material that would be a mirror if it were smoother."""
+    smooth = settings.replace(reflector_max_roughness=1.0)
+    notes = []
+    for part in scene.parts:
+        if mirror_weight(scene, part, smooth) and not mirror_weight(scene, part, settings):
+            material = scene.data.materials[part.material]
+            text = f"roughness {mirror_roughness(material):.3g} > {settings.reflector_max_roughness:g}"
+            text += " (reflector_max_roughness): no mirror; what it reflects is scattered"
+            notes.append(Note(material.path or part.prim_path, text))
+    return list(dict.fromkeys(notes))
 
 
 def prefer_forward(plan: Plan, earlier: Plan | None = None) -> Plan:

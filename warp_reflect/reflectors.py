@@ -4,11 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from warp_reflect.scene import PartRange, Scene, reflectance
+from warp_reflect.scene import MaterialData, PartRange, Scene, reflectance
 from warp_reflect.settings import Settings
 
 CLEARCOAT_MIN = 0.5  # a coat from here on is a mirror of its own (design: clearcoat >= 0.5)
 REC709_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+
+
+def mirror_roughness(material: MaterialData) -> float:
+    """Of the smoother layer of a coated material, of the material else."""
+    if material.clearcoat >= CLEARCOAT_MIN:
+        return min(material.roughness, material.clearcoat_roughness)
+    return material.roughness
 
 
 def mirror_weight(scene: Scene, part: PartRange, settings: Settings) -> float:

@@ -9,7 +9,7 @@ Approximates UsdPreviewSurface, textures included (`textures.py`):
   elsewhere, and for a mirror seen in a mirror, the dome;
 * roughness: up to `SHARP_ROUGHNESS` a surface mirrors, from `ROUGH_ROUGHNESS` on its specular share is
   reflected like Lambert's, between them it is divided linearly (a lobe's shape is not modelled); a reflector
-  mirrors whatever its roughness;
+  mirrors whatever its roughness, and a finish (`finishes/glossy.py`) gives its mirror image the lobe's shape;
 * the clear coat's roughness divides its share as the base's is divided;
 * energy: what the clear coat and the mirror term take is taken from the layers below;
 * normal maps turn the normal of what is no reflector, seen directly or in one; a reflector keeps its own.
@@ -56,11 +56,13 @@ class Shown:
     Attributes:
         looks: `Look` [height * width], see `textures.prepare_looks`.
         normals: vec3 [height * width], see `normal_maps.prepare_normals`.
+        seen: Radiance, vec3 [n], that a layer's rays see.
     """
 
     gbuffer: GBuffer
     looks: wp.array
     normals: wp.array
+    seen: Callable[[ReflectionLayer], wp.array]
 
 
 # Of what is shown, a mirror's layer and what its pixels see in a sharp mirror: what they see in this one.
@@ -571,10 +573,11 @@ def shade(
     inputs = [scene.view, gbuffer.view, lights, looks, normals, direct, sky, gbuffer.triangle, gbuffer.reflector_id]
     inputs += [picture, mirror]
     launch.launch(shade_kernel, count, inputs, device, threads)
+    shown = Shown(gbuffer, looks, normals, lambda layer: seen_radiance(scene, gbuffer, layer, threads, shadows))
     for layer in layers.values():
-        radiance = seen_radiance(scene, gbuffer, layer, threads, shadows)
+        radiance = shown.seen(layer)
         if finish is not None:
-            radiance = finish(Shown(gbuffer, looks, normals), layer, radiance)
+            radiance = finish(shown, layer, radiance)
         launch.launch(
             mirror_term_kernel, layer.pixels.count, [layer.pixels.pixel, radiance, picture, mirror], device, threads
         )
