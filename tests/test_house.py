@@ -20,11 +20,11 @@ FILES = {
 
 # A module imports from its own floor or below. A new module belongs into this table; `x.*` is a folder.
 FLOORS = {
-    1: "settings launch devices optics shapes bodies cubemap quadrics quadric_roots quadric_curve quadric_fit heightfield "
+    1: "settings launch vector devices optics shapes bodies cubemap quadrics quadric_roots quadric_curve quadric_fit heightfield "
     "grid_rays occupancy voxels "
     "images metrics timing clipping",
-    2: "scene reflectors environment_maps baked_maps segments layers bvh raster shade surface pictures textures normal_maps "
-    "direct shadows transmission channels stage stage.* scene_field",
+    2: "scene reflectors environment_maps baked_maps segments layers bvh raster raster_vector shade surface pictures textures "
+    "normal_maps direct shadows transmission channels stage stage.* scene_field",
     3: "solve solver solve_device solve_plane solve_convex solve_map solve_general solve_qim solver_gradients mirrors "
     "refraction solve_refraction solver_arrays reflector_maps techniques techniques.* finishes finishes.*",
     4: "planner effects lighting probe budget choice applicable calibration realised bake frame motion virtual_objects seen "

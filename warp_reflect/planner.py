@@ -6,7 +6,7 @@ import dataclasses
 import difflib
 from dataclasses import dataclass, field
 
-from warp_reflect import __version__, applicable, choice, raster, transmission
+from warp_reflect import __version__, applicable, choice, raster, transmission, vector
 from warp_reflect.applicable import PREFERRED
 from warp_reflect.budget import BUILT_IN, Costs, fixed_ms, predict
 from warp_reflect.effects import Effect, finish_effects, pane_effects
@@ -306,6 +306,8 @@ def make_plan(
             Note(path, "texture of normal: a mirror reflects at the surface itself; its normal map is not used")
         )
     notes += _too_rough(scene, settings)
+    if settings.kernels != "plain" and not scene.device.is_cuda and vector.missing():
+        notes.append(Note("", f"plain kernels only: {vector.missing()} (kernels={settings.kernels})"))
     made = Plan(scene, view, settings, method, rows, panes, notes, lights, costs)
     _fit(made, 1.0 if earlier is None else earlier.pace)
     _take_over(made, earlier)

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from warp_reflect import vector
 from warp_reflect.launch import launch, launch_bands, slice_length
 from warp_reflect.layers import Camera, CameraView, GBuffer, MirrorPixels, project
 from warp_reflect.scene import Scene
@@ -55,9 +56,8 @@ class TargetView:
     far: float
     orthographic: int
     painter: int  # 1: a triangle has one depth, that of its middle
-    # Exact depth of virtual triangles (see `attach_rays`); length 0: the depth key is interpolated.
-    ray_origin: wp.array(dtype=wp.vec4)
-    ray_direction: wp.array(dtype=wp.vec4)
+    # Exact depth of virtual triangles (see `attach_rays`), two vectors per cell; length 0: the depth key is interpolated.
+    ray: wp.array(dtype=wp.vec4)
 
 
 @wp.struct
@@ -139,8 +139,8 @@ def ray_key(target: TargetView, cell: int, plane: PlaneView, interpolated: float
     Straight virtual triangles are wrong in depth; the ray's own distance to the triangle's plane orders them right. Where
     the ray runs along the plane, or meets it far from where the virtual triangle says, the latter stands.
     """
-    origin = target.ray_origin[cell]
-    direction = target.ray_direction[cell]
+    origin = target.ray[2 * cell]
+    direction = target.ray[2 * cell + 1]
     # The interpolated key is 1 / depth along the camera's axis; direction.w is the eye ray's length at depth 1.
     path = direction[3] / interpolated
     along = plane.n[0] * direction[0] + plane.n[1] * direction[1] + plane.n[2] * direction[2]
@@ -223,7 +223,7 @@ def draw_triangle(
                     if target.mask_value > 0:
                         visible = target.mask[y * target.mask_width + x] == target.mask_value
                     if visible:
-                        if target.ray_origin.shape[0] > 0:
+                        if target.ray.shape[0] > 0:
                             depth_key = ray_key(target, cell + x, plane, depth_key)
                         wp.atomic_max(target.key, cell + x, pack_key(depth_key, triangle))
             ea -= pixel_step(dya)
@@ -369,6 +369,16 @@ def at_depth(v: wp.vec4, key: float) -> wp.vec4:
     return wp.vec4(v[0], v[1], wp.where(v[2] > 0.0, key, v[2]), v[3])
 
 
+@wp.func
+def triangle_plane(points: wp.array(dtype=wp.vec3), corners: wp.vec3i) -> PlaneView:
+    plane = PlaneView()
+    p = points[corners[0]]
+    # Unit length: RAY_ALONG_MIN is a sine.
+    plane.n = unit(wp.cross(points[corners[1]] - p, points[corners[2]] - p))
+    plane.offset = wp.dot(plane.n, p)
+    return plane
+
+
 @wp.kernel
 def draw_kernel(
     first: int,
@@ -399,12 +409,8 @@ def draw_kernel(
     if ids.shape[0] > 0:
         triangle = ids[t]
     plane = PlaneView()
-    if target.ray_origin.shape[0] > 0:
-        own = plane_triangles[t]
-        p = points[own[0]]
-        # Unit length: RAY_ALONG_MIN is a sine.
-        plane.n = unit(wp.cross(points[own[1]] - p, points[own[2]] - p))
-        plane.offset = wp.dot(plane.n, p)
+    if target.ray.shape[0] > 0:
+        plane = triangle_plane(points, plane_triangles[t])
     if target.painter != 0:
         middle = (a[2] + b[2] + c[2]) / 3.0
         a = at_depth(a, middle)
@@ -444,10 +450,9 @@ def ray_image_kernel(
     x0: int,
     y0: int,
     box_width: int,
-    out_origin: wp.array(dtype=wp.vec4),
-    out_direction: wp.array(dtype=wp.vec4),
+    out_ray: wp.array(dtype=wp.vec4),
 ):
-    """One thread per mirror pixel: its ray, the eye's distance, and the eye ray's length at depth 1."""
+    """One thread per mirror pixel: (origin, the eye's distance) and (direction, the eye ray's length at depth 1)."""
     i = first + wp.tid()
     row = pixel[i] / camera.width
     cell = (row - y0) * box_width + pixel[i] - row * camera.width - x0
@@ -455,19 +460,19 @@ def ray_image_kernel(
     d = direction[i]
     to_eye = p - camera.eye
     distance = wp.length(to_eye)
-    out_origin[cell] = wp.vec4(p[0], p[1], p[2], distance)
-    out_direction[cell] = wp.vec4(d[0], d[1], d[2], distance / wp.max(wp.dot(camera.forward, to_eye), 1.0e-30))
+    out_ray[2 * cell] = wp.vec4(p[0], p[1], p[2], distance)
+    out_ray[2 * cell + 1] = wp.vec4(d[0], d[1], d[2], distance / wp.max(wp.dot(camera.forward, to_eye), 1.0e-30))
 
 
 def attach_rays(target: Target, camera: CameraView, pixels: MirrorPixels, threads: int = 0) -> None:
-    """Give a target the reflected rays of its pixels: triangles drawn into it are ordered by exact path length."""
+    """Give a target the reflected rays of its pixels: triangles drawn into it are ordered by exact path length.
+
+    Cells without a ray hold zeros.
+    """
     device = target.key.device
-    cells = len(target.key)
-    target.view.ray_origin = wp.empty(cells, dtype=wp.vec4, device=device)
-    target.view.ray_direction = wp.empty(cells, dtype=wp.vec4, device=device)
+    target.view.ray = wp.zeros(2 * len(target.key), dtype=wp.vec4, device=device)
     x0, y0, x1, _ = target.box
-    inputs = [camera, pixels.pixel, pixels.point, pixels.direction, x0, y0, x1 - x0]
-    inputs += [target.view.ray_origin, target.view.ray_direction]
+    inputs = [camera, pixels.pixel, pixels.point, pixels.direction, x0, y0, x1 - x0, target.view.ray]
     launch(ray_image_kernel, pixels.count, inputs, device, threads)
 
 
@@ -501,8 +506,7 @@ def make_target(
     view.near = camera.near
     view.far = camera.far
     view.orthographic = camera.orthographic
-    view.ray_origin = wp.empty(0, dtype=wp.vec4, device=device)
-    view.ray_direction = wp.empty(0, dtype=wp.vec4, device=device)
+    view.ray = wp.empty(0, dtype=wp.vec4, device=device)
     return Target(view, key, box)
 
 
@@ -516,6 +520,7 @@ def rasterise(
     points: wp.array | None = None,
     plane_triangles: wp.array | None = None,
     threads: int = 0,
+    kernels: str = "auto",
 ) -> int:
     """Draw triangles into a target; repeated calls accumulate.
 
@@ -528,6 +533,7 @@ def rasterise(
         points: vec3, where the target has rays: the triangles' real corners, in the frame of the rays.
         plane_triangles: vec3i [triangle_count], indices into `points`; None: the triangles themselves.
         threads: CPU threads.
+        kernels: `Settings.kernels`.
 
     Returns:
         Triangles that survived the culling (0 on CUDA, where the count stays on the device).
@@ -553,7 +559,12 @@ def rasterise(
     counts = survivor_count.numpy()
     ranges = [(k * step, int(n)) for k, n in enumerate(counts) if n > 0]
     bands = row_bands(target.box[1], target.box[3], slice_count)
-    launch_bands(draw_kernel, ranges, bands, inputs, device)
+    kernel = draw_kernel
+    if vector.chosen(kernels, device):
+        from warp_reflect import raster_vector  # which draws with this module's functions
+
+        kernel = raster_vector.draw_lanes_kernel
+    launch_bands(kernel, ranges, bands, inputs, device)
     return int(counts.sum())
 
 
@@ -574,13 +585,16 @@ def kept_triangles(scene: Scene, without: Collection[int]) -> list[tuple[int, in
     return ranges
 
 
-def draw_scene(scene: Scene, camera: Camera, threads: int = 0, without: Collection[int] = ()) -> GBuffer:
+def draw_scene(
+    scene: Scene, camera: Camera, threads: int = 0, without: Collection[int] = (), kernels: str = "auto"
+) -> GBuffer:
     """The eye view of a scene: per pixel the nearest triangle and its depth key.
 
     Args:
         scene, camera: What is drawn, and from where.
         threads: CPU threads; 0: one per core.
         without: Parts that are left out, indices into `scene.parts`.
+        kernels: `Settings.kernels`.
     """
     device = scene.device
     view = camera.view(scene)
@@ -589,7 +603,8 @@ def draw_scene(scene: Scene, camera: Camera, threads: int = 0, without: Collecti
     screen = wp.empty(scene.vertex_count, dtype=wp.vec4, device=device)
     launch(project_kernel, scene.vertex_count, [scene.view.points, view, screen], device, threads)
     for first, end in kept_triangles(scene, without):
-        rasterise(target, screen, scene.view.triangles[first:end], id_offset=first, threads=threads)
+        triangles = scene.view.triangles[first:end]
+        rasterise(target, screen, triangles, id_offset=first, threads=threads, kernels=kernels)
     triangle = wp.empty(width * height, dtype=int, device=device)
     depth_key = wp.empty(width * height, dtype=float, device=device)
     launch(resolve_kernel, width * height, [target.key, triangle, depth_key], device, threads)

@@ -410,6 +410,14 @@ class Scene:
         return wp.array(closed, dtype=int, device=self.device)
 
     @cached_property
+    def triangle_records(self) -> wp.array:
+        """float32 [triangle_count, 12]: what a ray test reads on one cache line: three corners, then 1 where closed."""
+        record = np.zeros((self.triangle_count, 12), np.float32)
+        record[:, :9] = self.host_points[self.host_triangles].reshape(-1, 9)
+        record[:, 9] = self.closed_patches.numpy()[self.host_triangle_patch]
+        return wp.array(record.reshape(-1), dtype=float, device=self.device)
+
+    @cached_property
     def boxes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Per instance (first vertex, vertex count, corners of its box, float64 [n, 8, 3], scene frame)."""
         spans = sorted({(part.first_vertex, part.vertex_count) for part in self.parts if part.vertex_count})

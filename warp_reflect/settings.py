@@ -65,6 +65,7 @@ SWITCHES = {"1": "on", "true": "on", "on": "on", "0": "off", "false": "off", "of
 ENVIRONMENT_UPDATES = ("static", "frame", "previous")
 FIELDS = ("auto", "heightfield", "occupancy")
 GLOSSY = ("filter", "accumulate", "off")
+KERNELS = ("auto", "plain", "vector")
 
 
 @dataclass(frozen=True)
@@ -125,6 +126,8 @@ class Settings:
     """Transparent surfaces behind one another that are looked through; nothing is seen through the next."""
     threads: int = 0
     """CPU threads of a launch; 0: one per core."""
+    kernels: str = "auto"
+    """`auto` (vector kernels where this CPU's compiler has them), `plain` (never) or `vector` (an error where it has none)."""
     shadows: str = "auto"
     """Shadows of distant lights and of shapes that emit: `auto` (of those that cast them into view), `on` or `off`."""
     shadow_min_share: float = 0.001
@@ -195,6 +198,7 @@ class Settings:
         _require(self.glossy in GLOSSY, "glossy", self.glossy, f"one of {', '.join(GLOSSY)}")
         _require(0 <= self.glossy_samples <= 65536, "glossy_samples", self.glossy_samples, "0 (its own) to 65536")
         _require(0.0 <= self.glossy_min_roughness <= 1.0, "glossy_min_roughness", self.glossy_min_roughness, "0 to 1")
+        _require(self.kernels in KERNELS, "kernels", self.kernels, f"one of {', '.join(KERNELS)}")
         _require(0 <= self.threads <= 1024, "threads", self.threads, "0 (all cores) to 1024")
         _require(
             0.0 <= self.reflector_max_roughness <= 1.0,

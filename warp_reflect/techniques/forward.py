@@ -252,7 +252,14 @@ def reflect(
         target.view.painter = int(settings.occlusion == "painter")
         if settings.refine != "off":
             raster.attach_rays(target, gbuffer.view, pixels, settings.threads)
-        drawn = raster.rasterise(target, vertices.screen, mesh.triangles, points=mesh.points, threads=settings.threads)
+        drawn = raster.rasterise(
+            target,
+            vertices.screen,
+            mesh.triangles,
+            points=mesh.points,
+            threads=settings.threads,
+            kernels=settings.kernels,
+        )
         straddling, failed = _draw_straddling(scene, mesh, target, frame, vertices, solve_boundary, gbuffer, settings)
         clipped = 0 if straddling is None else len(straddling.boundary) // 2
         layer.virtual = [Drawn(pixels, mesh, vertices.screen, straddling)]
@@ -387,5 +394,6 @@ def _draw_straddling(
         points=mesh.points,
         plane_triangles=wp.array(mesh.host_triangles[owners], dtype=wp.vec3i, device=scene.device),
         threads=settings.threads,
+        kernels=settings.kernels,
     )
     return Straddling(np.concatenate([a, b, c]), cut_points, triangles, owners), failed

@@ -443,7 +443,13 @@ def reflect_branches(
         doubt = np.zeros((target.box[3] - target.box[1] + 1, target.box[2] - target.box[0] + 1), np.int64)
         for k, (mesh, vertices) in enumerate(branches):
             drawn += raster.rasterise(
-                target, vertices.screen, mesh.triangles, id_offset=offset, points=mesh.points, threads=settings.threads
+                target,
+                vertices.screen,
+                mesh.triangles,
+                id_offset=offset,
+                points=mesh.points,
+                threads=settings.threads,
+                kernels=settings.kernels,
             )
             offset += len(mesh.triangles)
             solved = vertices.status.numpy() == int(Status.CONVERGED)

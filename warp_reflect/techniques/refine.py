@@ -11,12 +11,13 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from warp_reflect import raster
+from warp_reflect import raster, vector
 from warp_reflect.launch import FINITE_FLAGS, launch
 from warp_reflect.layers import GBuffer, MirrorPixels, ReflectionLayer
 from warp_reflect.scene import Scene, SceneView
 from warp_reflect.settings import Settings, Status
 from warp_reflect.shapes import clamp_weights, intersect_triangle
+from warp_reflect.techniques import refine_vector
 from warp_reflect.techniques.virtual_mesh import VirtualMesh
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FINITE_FLAGS})
@@ -245,26 +246,17 @@ def settle(
         int32 indices into `pixels` of what the BVH must decide.
     """
     settled = wp.empty(pixels.count, dtype=wp.uint8, device=scene.device)
-    launch(
-        settle_kernel,
-        pixels.count,
-        [
-            scene.view,
-            scene.neighbours,
-            scene.closed_patches,
-            target.view,
-            mesh.parents,
-            mesh.patches,
-            pixels.pixel,
-            pixels.point,
-            pixels.direction,
-            blocked,
-        ]
-        + [settings.walk_hops, int(trust_sky), int(wary or settings.refine == "strict")]
-        + [layer.triangle, layer.u, layer.v, layer.distance, layer.status, settled],
-        scene.device,
-        settings.threads,
-    )
+    picture = [mesh.parents, mesh.patches, pixels.pixel, pixels.point, pixels.direction, blocked]
+    how = [settings.walk_hops, int(trust_sky), int(wary or settings.refine == "strict")]
+    outputs = [layer.triangle, layer.u, layer.v, layer.distance, layer.status, settled]
+    if vector.chosen(settings.kernels, scene.device):
+        records = [target.view, scene.neighbours, scene.triangle_records]
+        limits = [DEPTH_STEP, FINE_STEP, NEARER_SHARE, CONVERGED, SKY]
+        inputs = [*records, *picture, *how, *limits, *outputs]
+        vector.launch_blocks(refine_vector.settle_blocks_kernel, pixels.count, inputs, scene.device, settings.threads)
+    else:
+        inputs = [scene.view, scene.neighbours, scene.closed_patches, target.view, *picture, *how, *outputs]
+        launch(settle_kernel, pixels.count, inputs, scene.device, settings.threads)
     host = settled.numpy()
     if seen is not None:
         triangle = layer.triangle.numpy()

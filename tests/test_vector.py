@@ -1,0 +1,157 @@
+"""Vector kernels against the plain ones: the same bits, on every shape of triangle and on every scene."""
+
+import numpy as np
+import pytest
+import warp as wp
+from rooms import placed, plane_room, room, sphere
+
+import warp_reflect as wr
+from warp_reflect import vector
+from warp_reflect.layers import CameraView
+from warp_reflect.raster import make_target, rasterise
+
+wp.set_module_options({"enable_backward": False})
+CPU = wp.get_device("cpu")
+
+
+def target_of(width, height, rays=None, mask=None):
+    view = CameraView()
+    view.width, view.height = width, height
+    view.near, view.far = 1.0e-3, 1.0e3
+    if mask is None:
+        target = make_target(view, (0, 0, width, height), CPU)
+    else:
+        target = make_target(view, (0, 0, width, height), CPU, wp.array(mask.reshape(-1), dtype=int, device=CPU), 1)
+    if rays is not None:
+        target.view.ray = wp.array(rays, dtype=wp.vec4, device=CPU)
+    return target
+
+
+def drawn(kernels, screen, triangles, width, height, rays=None, mask=None, points=None, threads=1):
+    target = target_of(width, height, rays, mask)
+    rasterise(
+        target,
+        wp.array(screen, dtype=wp.vec4, device=CPU),
+        wp.array(triangles, dtype=wp.vec3i, device=CPU),
+        points=None if points is None else wp.array(points, dtype=wp.vec3, device=CPU),
+        threads=threads,
+        kernels=kernels,
+    )
+    return target.key.numpy()
+
+
+def corners_of(kind, rng, count, width, height):
+    """Screen corners float32 [3 * count, 4]: x, y, depth key, 1 / w."""
+    middle = rng.uniform((0, 0), (width, height), (count, 1, 2))
+    size = {"tiny": 0.7, "small": 12.0, "edge": 64.0, "large": 900.0}[kind]
+    xy = middle + rng.uniform(-size, size, (count, 3, 2))
+    if kind == "edge":
+        # Boxes of exactly 64 pixels and a little either side, and corners on pixel centres and borders.
+        xy = np.round(xy * 2.0) / 2.0
+        xy[:, 1] = xy[:, 0] + rng.choice([63.5, 64.0, 64.5], (count, 2)) * rng.choice([-1, 1], (count, 2))
+    key = rng.uniform(0.01, 1.0, (count, 3, 1))
+    return np.concatenate([xy, key, np.ones((count, 3, 1))], -1).reshape(-1, 4).astype(np.float32)
+
+
+def test_this_machine_has_vector_kernels_or_says_why():
+    why = vector.missing()
+    assert not why or why.startswith(("the compiler refuses", "they compile but"))
+    assert vector.chosen("auto", CPU) == (not why)
+    assert not vector.chosen("plain", CPU)
+
+
+@pytest.mark.parametrize("kind", ["tiny", "small", "edge", "large"])
+@pytest.mark.parametrize("size", [(7, 5), (131, 97)])
+def test_triangles_are_drawn_bit_for_bit_as_the_plain_kernel_draws_them(kind, size):
+    rng = np.random.default_rng(len(kind))
+    count = 400
+    screen = corners_of(kind, rng, count, *size)
+    triangles = np.arange(3 * count, dtype=np.int32).reshape(-1, 3)
+    plain = drawn("plain", screen, triangles, *size)
+    assert (plain > 0).any()
+    np.testing.assert_array_equal(drawn("vector", screen, triangles, *size), plain)
+    np.testing.assert_array_equal(drawn("vector", screen, triangles, *size, threads=2), plain)
+
+
+@pytest.mark.parametrize("kind", ["tiny", "small", "large"])
+@pytest.mark.parametrize("with_rays", [False, True])
+def test_masks_and_rays_are_honoured_bit_for_bit(kind, with_rays):
+    rng = np.random.default_rng(5)
+    width, height, count = 101, 77, 300
+    screen = corners_of(kind, rng, count, width, height)
+    triangles = np.arange(3 * count, dtype=np.int32).reshape(-1, 3)
+    mask = (rng.random((height, width)) < 0.7).astype(np.int32)
+    rays = points = None
+    if with_rays:
+        turned = rng.normal(size=(height * width, 3))
+        turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+        ray = np.zeros((height * width, 2, 4), np.float32)
+        ray[:, 0, :3], ray[:, 0, 3] = rng.normal(size=(height * width, 3)), rng.uniform(1, 3, height * width)
+        ray[:, 1, :3], ray[:, 1, 3] = turned, rng.uniform(1.0, 1.5, height * width)
+        ray[mask.reshape(-1) == 0] = 0.0
+        rays = ray.reshape(-1, 4)
+        points = rng.normal(size=(3 * count, 3)).astype(np.float32) * 3.0
+    args = screen, triangles, width, height, rays, mask, points
+    plain = drawn("plain", *args)
+    assert (plain > 0).any() and not plain.reshape(height, width)[mask == 0].any()
+    np.testing.assert_array_equal(drawn("vector", *args), plain)
+
+
+def test_what_cannot_be_drawn_is_the_same_nothing():
+    """Zero area, dropped corners (key 0), not finite, far outside, behind the eye."""
+    odd = [np.nan, np.inf, -np.inf, 0.0, 1e-30, -5.0, 1e9, 20.0, 33.5]
+    rng = np.random.default_rng(1)
+    screen = rng.choice(odd, (3000, 4)).astype(np.float32)
+    # What is in front of the eye has a positive 1 / w and finite places: the vertex stage sees to that.
+    good = np.isfinite(screen).all(axis=1)
+    screen[~good] = (0.0, 0.0, 0.0, 0.0)
+    triangles = rng.integers(0, 3000, (2000, 3), dtype=np.int32)
+    plain = drawn("plain", screen, triangles, 64, 48)
+    np.testing.assert_array_equal(drawn("vector", screen, triangles, 64, 48), plain)
+
+
+def scenes():
+    return {
+        "ball": lambda: room(sphere(), placed(0, 0, -1)),
+        "small ball": lambda: room(sphere(6, 9), placed(0.4, 0.2, -2, 0.4)),
+        "plane": plane_room,
+    }
+
+
+@pytest.mark.parametrize("refine", ["exact", "strict"])
+@pytest.mark.parametrize("name", scenes())
+def test_frames_are_the_same_bit_for_bit(name, refine):
+    scene = scenes()[name]()
+    frames = {}
+    for kernels, threads in (("plain", 1), ("vector", 1), ("vector", 2)):
+        settings = wr.Settings(kernels=kernels, threads=threads, refine=refine)
+        plan = wr.make_plan(scene, size=(173, 101), settings=settings, method="reflector_map")
+        if name == "plane":
+            plan = wr.make_plan(scene, size=(173, 101), settings=settings, method="planar")
+        assert all(row.forced for row in plan.rows)
+        frames[kernels, threads] = wr.render_frame(scene, plan)
+    plain = frames.pop(("plain", 1))
+    assert plain.statistics["candidate"] > 50
+    for frame in frames.values():
+        for channel in plain.keys():
+            np.testing.assert_array_equal(frame[channel], plain[channel], err_msg=channel)
+        assert frame.statistics == plain.statistics
+
+
+def test_unknown_kernels_are_refused_and_missing_ones_are_told(monkeypatch):
+    with pytest.raises(ValueError, match="setting 'kernels': got 'fast', expected one of auto, plain, vector"):
+        wr.Settings(kernels="fast")
+    monkeypatch.setattr(vector, "missing", lambda: "the compiler refuses them: no such type")
+    with pytest.raises(RuntimeError, match="kernels=vector: the compiler refuses them"):
+        vector.chosen("vector", CPU)
+    scene = room(sphere(6, 9), placed(0, 0, -1))
+    plan = wr.make_plan(scene, size=(48, 27))
+    assert [note.text for note in plan.notes if "kernels" in note.text] == [
+        "plain kernels only: the compiler refuses them: no such type (kernels=auto)"
+    ]
+    assert not [
+        n
+        for n in wr.make_plan(scene, size=(48, 27), settings=wr.Settings(kernels="plain")).notes
+        if "kernels" in n.text
+    ]
+    assert wr.render_frame(scene, plan)["RGBA"].max() > 0

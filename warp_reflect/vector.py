@@ -1,0 +1,183 @@
+"""Vector kernels: native snippets in which one task works on a block of elements, and whether this platform has them.
+
+Warp's CPU code is scalar and waits for itself: every task is one chain of dependent operations. A snippet that carries 8 or
+16 elements through the same branch-free operations in Clang's vector types keeps the processor busy; the type lowers to
+whatever the processor has (SSE2 to AVX-512, NEON). Each lies beside its plain kernel and behind the same wrapper. The plain
+kernel is the reference, runs on CUDA, and answers what a snippet leaves.
+
+A kernel with such a snippet takes `first` and counts *blocks* of `BLOCK` elements: launch it with `block_count(n)` tasks.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import warp as wp
+
+from warp_reflect.launch import CPU_BLOCK_DIM, launch
+
+wp.set_module_options({"enable_backward": False})
+
+BLOCK = 64  # elements per task: what one of them leaves over fills the vectors of a second pass
+BLOCK_SPLIT_MIN = 64  # blocks: what `launch.SPLIT_MIN` elements are
+
+# Shared head of every snippet: types, and the few operations that vector extensions have no operator for.
+_HEAD = r"""
+// Unrolled: a lane that is named by a variable would be kept in memory.
+#define EACH_LANE _Pragma("clang loop unroll(full)") for (int l = 0; l < LANES; ++l)
+#if defined(__AVX512F__)
+    constexpr int LANES = 16;
+    typedef unsigned short LaneBits;
+#else
+    constexpr int LANES = 8;
+    typedef unsigned char LaneBits;
+#endif
+    constexpr int BLOCK = 64;
+    typedef float F __attribute__((ext_vector_type(LANES)));
+    typedef int I __attribute__((ext_vector_type(LANES)));
+    typedef unsigned U __attribute__((ext_vector_type(LANES)));
+    typedef unsigned long long L __attribute__((ext_vector_type(LANES)));
+    typedef bool B __attribute__((ext_vector_type(LANES)));
+    struct V { F x, y, z; };
+    // One bit per lane of a mask.
+    auto bits = [](I mask) -> unsigned {
+        return __builtin_bit_cast(LaneBits, __builtin_convertvector(mask < 0, B));
+    };
+    auto lanes = []() -> I { I v; EACH_LANE v[l] = l; return v; };
+    auto pick = [](I mask, F a, F b) -> F { return mask ? a : b; };
+    auto ipick = [](I mask, I a, I b) -> I { return mask ? a : b; };
+    auto fmin = [](F a, F b) -> F { return a < b ? a : b; };
+    auto fmax = [](F a, F b) -> F { return a > b ? a : b; };
+    auto sub = [](V a, V b) -> V { return V{a.x - b.x, a.y - b.y, a.z - b.z}; };
+    auto add = [](V a, V b) -> V { return V{a.x + b.x, a.y + b.y, a.z + b.z}; };
+    auto dot = [](V a, V b) -> F { return a.x * b.x + a.y * b.y + a.z * b.z; };
+    auto cross = [](V a, V b) -> V {
+        return V{a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
+    };
+    auto load = [](const float* p) -> F { F v; __builtin_memcpy(&v, p, sizeof(v)); return v; };
+    auto iload = [](const int* p) -> I { I v; __builtin_memcpy(&v, p, sizeof(v)); return v; };
+    auto store = [](float* p, F v) { __builtin_memcpy(p, &v, sizeof(v)); };
+    auto istore = [](int* p, I v) { __builtin_memcpy(p, &v, sizeof(v)); };
+    // Elements index[l] of an array.
+    auto gather = [](const float* p, I index) -> F { F v; EACH_LANE v[l] = p[index[l]]; return v; };
+    auto igather = [](const int* p, I index) -> I { I v; EACH_LANE v[l] = p[index[l]]; return v; };
+    // Low and high halves of LANES 64-bit words.
+    auto halves = [](const unsigned long long* p, I& low, I& high) {
+        I a, b;
+        __builtin_memcpy(&a, p, sizeof(a));
+        __builtin_memcpy(&b, p + LANES / 2, sizeof(b));
+#if defined(__AVX512F__)
+        low = __builtin_shufflevector(a, b, 0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
+        high = __builtin_shufflevector(a, b, 1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31);
+#else
+        low = __builtin_shufflevector(a, b, 0, 2, 4, 6, 8, 10, 12, 14);
+        high = __builtin_shufflevector(a, b, 1, 3, 5, 7, 9, 11, 13, 15);
+#endif
+    };
+    // Eight floats at p[start[l]] of every lane, as eight vectors: whole rows are read and transposed.
+    typedef float Row __attribute__((ext_vector_type(8)));
+    auto transposed = [](const float* p, const int* start, Row* out) {
+        Row r[8], s[8];
+        _Pragma("clang loop unroll(full)") for (int k = 0; k < 8; ++k) __builtin_memcpy(&r[k], p + start[k], sizeof(Row));
+        _Pragma("clang loop unroll(full)") for (int k = 0; k < 8; k += 2) {
+            s[k] = __builtin_shufflevector(r[k], r[k + 1], 0, 8, 1, 9, 4, 12, 5, 13);
+            s[k + 1] = __builtin_shufflevector(r[k], r[k + 1], 2, 10, 3, 11, 6, 14, 7, 15);
+        }
+        _Pragma("clang loop unroll(full)") for (int k = 0; k < 8; k += 4) {
+            r[k] = __builtin_shufflevector(s[k], s[k + 2], 0, 1, 8, 9, 4, 5, 12, 13);
+            r[k + 1] = __builtin_shufflevector(s[k], s[k + 2], 2, 3, 10, 11, 6, 7, 14, 15);
+            r[k + 2] = __builtin_shufflevector(s[k + 1], s[k + 3], 0, 1, 8, 9, 4, 5, 12, 13);
+            r[k + 3] = __builtin_shufflevector(s[k + 1], s[k + 3], 2, 3, 10, 11, 6, 7, 14, 15);
+        }
+        _Pragma("clang loop unroll(full)") for (int k = 0; k < 4; ++k) {
+            out[k] = __builtin_shufflevector(r[k], r[k + 4], 0, 1, 2, 3, 8, 9, 10, 11);
+            out[k + 4] = __builtin_shufflevector(r[k], r[k + 4], 4, 5, 6, 7, 12, 13, 14, 15);
+        }
+    };
+    auto gather8 = [transposed](const float* p, I start, F* out) {
+        int at[LANES];
+        __builtin_memcpy(at, &start, sizeof(at));
+        Row rows[LANES];
+        transposed(p, at, rows);
+#if defined(__AVX512F__)
+        transposed(p, at + 8, rows + 8);
+        _Pragma("clang loop unroll(full)") for (int k = 0; k < 8; ++k)
+            out[k] = __builtin_shufflevector(rows[k], rows[k + 8], 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+#else
+        _Pragma("clang loop unroll(full)") for (int k = 0; k < 8; ++k) out[k] = rows[k];
+#endif
+    };
+    auto vgather = [](const float* p, I index) -> V {
+        V v;
+        EACH_LANE {
+            const float* q = p + 3 * index[l];
+            v.x[l] = q[0]; v.y[l] = q[1]; v.z[l] = q[2];
+        }
+        return v;
+    };
+    (void)bits; (void)lanes; (void)pick; (void)ipick; (void)fmin; (void)fmax; (void)sub; (void)add; (void)dot; (void)cross;
+    (void)load; (void)iload; (void)store; (void)istore; (void)gather; (void)igather; (void)vgather; (void)halves; (void)gather8;
+"""
+
+
+def snippet(body: str) -> str:
+    """The text of a native function: `body` after the shared head on a CPU, nothing for CUDA (where it is never launched)."""
+    return "#if !defined(__CUDACC_RTC__) && !defined(__CUDA_ARCH__)\n" + _HEAD + body + "\n#endif\n"
+
+
+def block_count(count: int) -> int:
+    """Tasks over `count` elements."""
+    return -(-count // BLOCK)
+
+
+def launch_blocks(kernel, count: int, inputs: list, device, threads: int = 0) -> None:
+    """Run a vector kernel, whose arguments after `first` are `inputs`, over `count` elements."""
+    launch(kernel, block_count(count), inputs, device, threads, split_min=BLOCK_SPLIT_MIN)
+
+
+@wp.func_native(
+    snippet(r"""
+    F x = __builtin_convertvector(lanes(), F) + 1.0f;
+    V v = cross(V{x, x, x}, V{x, x + 1.0f, x});
+    F root = __builtin_elementwise_sqrt(fmax(dot(v, v), x));
+    EACH_LANE out.data[l] = bits(root > 1.0f) != 0 ? root[l] : 0.0f;
+    for (int l = LANES; l < BLOCK; ++l) out.data[l] = __builtin_sqrtf(2.0f) * (l + 1);
+""")
+)
+def probe(out: wp.array(dtype=float)): ...
+
+
+@wp.kernel
+def probe_kernel(first: int, out: wp.array(dtype=float)):
+    probe(out)
+
+
+@cache
+def missing() -> str:
+    """Why vector kernels cannot run on this machine's CPU; empty where they can. Compiles a small one to find out."""
+    try:
+        probe_kernel.module.load(wp.get_device("cpu"), CPU_BLOCK_DIM)
+        out = wp.zeros(BLOCK, dtype=float, device="cpu")
+        launch(probe_kernel, 1, [out], "cpu", 1)
+        values = out.numpy()
+    except Exception as error:  # whatever a foreign compiler says
+        return f"the compiler refuses them: {str(error).splitlines()[0][:120] if str(error) else type(error).__name__}"
+    good = all(abs(value - 2.0**0.5 * (k + 1)) < 1.0e-5 * (k + 1) for k, value in enumerate(values))
+    return "" if good else "they compile but calculate wrongly"
+
+
+def chosen(kernels: str, device) -> bool:
+    """Whether the vector form of a kernel runs.
+
+    Args:
+        kernels: `Settings.kernels`.
+        device: Warp device; CUDA has the plain kernels.
+
+    Raises:
+        RuntimeError: `vector` was asked for and this CPU's compiler has none.
+    """
+    if kernels == "plain" or wp.get_device(device).is_cuda:
+        return False
+    if kernels == "vector" and missing():
+        raise RuntimeError(f"kernels=vector: {missing()}; use kernels=auto")
+    return not missing()
