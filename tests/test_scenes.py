@@ -46,7 +46,11 @@ def expectations(name: str) -> Expectations:
     )
 
 
-BASELINES = {"explosion_map", "environment"}  # show no exact hits: compared in tests of their own
+BASELINES = {
+    "explosion_map",
+    "environment",
+    "layered_environment",
+}  # show no exact hits: compared in tests of their own
 
 
 @functools.cache

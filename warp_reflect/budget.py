@@ -52,6 +52,10 @@ class Costs:
     """A texel of an environment map that is drawn: its ray, its shading."""
     map_triangle: float = 0.1
     """A triangle of the scene, for every face of such a map."""
+    blended: float = 0.13
+    """A texel of a local map and one of its reference maps: the depth test, the look-up."""
+    followed: float = 0.3
+    """A mirror pixel that is followed to what a local map holds, and looked up there."""
     eye_triangle: float = 0.12
     """A triangle in the eye's own view."""
     eye_pixel: float = 0.03
@@ -77,7 +81,9 @@ GRID_BASE = 0.5  # pixels
 GRID_NODES_MAX = 0.15  # `grid.NODES_MAX`
 GRID_MIN = 0.02
 REUSED_SHARE = 0.5  # of the vertices kept from frame to frame, at half a pixel and a slow walk
-TEXEL_BYTES = {"reflector_map": 32, "environment": 24}  # position and normal; radiance and coverage, distance, triangle
+# Position and normal; radiance and coverage, distance, triangle.
+TEXEL_BYTES = {"reflector_map": 32, "environment": 24, "layered_environment": 24}
+LOCAL_RAYS = 0.15  # share of a local map's texels that have a ray of their own
 
 # Errors, at the 95th percentile of the mirror pixels. Measured on this package's scenes where no other source is given.
 EDGE_ERROR = 0.4  # of the bend that `edge_px` allows: few edges use it up
@@ -189,7 +195,8 @@ def map_blur_px(pixels: int, resolution: int) -> float:
 
 
 def _texels(technique: str, settings: Settings) -> int:
-    resolution = {"reflector_map": settings.map_resolution, "environment": settings.environment_resolution}
+    resolution = {"reflector_map": settings.map_resolution}
+    resolution |= dict.fromkeys(("environment", "layered_environment"), settings.environment_resolution)
     return 6 * resolution.get(technique, 0) ** 2
 
 
@@ -202,6 +209,10 @@ def _microseconds(work: Work, technique: str, settings: Settings, costs: Costs) 
         drawn = _texels(technique, settings) * costs.map_texel + 6 * work.scene_triangles * costs.map_triangle
         drawn = 0.0 if settings.environment_update == "static" else drawn
         return (costs.layer + work.pixels * costs.looked_up + drawn,) * 2
+    if technique == "layered_environment":
+        local = _texels(technique, settings) * (settings.rem_count * costs.blended + LOCAL_RAYS * ray)
+        shown = costs.layer + work.pixels * costs.followed
+        return shown, shown + local
     added = 0.0 if technique == "planar" else _added_share(settings)
     cold, warm = _search(work.vertices, technique, settings, costs)
     every = costs.layer + work.triangles * (1.0 + added) * costs.draw
@@ -249,6 +260,8 @@ def _error(work: Work, technique: str, settings: Settings) -> tuple[float, float
     """(95th percentile in pixels, share of wrong pixels)."""
     if technique == "raytraced":
         return 0.0, 0.0
+    if technique == "layered_environment":
+        return map_blur_px(work.pixels, settings.environment_resolution), 0.0
     if technique == "environment":
         return work.parallax_px + map_blur_px(work.pixels, settings.environment_resolution), 0.0
     curved = technique != "planar"

@@ -42,8 +42,6 @@ LUMA_CODES = 510
 PALETTE = wp.constant(1024)
 PALETTE_GRID = 512  # cells along each axis of the chromaticities, halved until no more are met than the palette holds
 LUMA_STOPS = 12.0  # below a map's brightest texel; darker is stored as this
-BEHIND_SHARE = 0.5  # of the covered texels: a map that sees so many closed bodies from within stands in a wall
-BEHIND_STRIDE = 3  # texels between those that are asked; prime to the sizes of maps
 
 
 @wp.struct
@@ -398,10 +396,10 @@ def render_maps(
     if not np.isfinite(centres).all():
         raise ValueError("centres: expected finite points")
     axes = np.tile(np.eye(3), (len(centres), 1, 1)) if axes is None else np.asarray(axes, np.float64)
-    maps = _empty_maps(scene, centres, axes, resolution, levels)
+    maps = empty_maps(scene, centres, axes, resolution, levels)
     for k, centre in enumerate(centres):
         for face in range(FACE_COUNT):
-            camera = _face_camera(scene, centre, axes[k], face, resolution)
+            camera = face_camera(scene, centre, axes[k], face, resolution)
             _draw_face(scene, camera, maps, k, face, without[k] if without else (), onward, shadows, threads)
     for level in range(1, maps.view.level_count):
         n = int(maps.view.level_size.numpy()[level])
@@ -421,7 +419,7 @@ def stored_maps(
         radiance: RGB times coverage, coverage; float32 [count, 6, n, n, 4].
         distance: 0 sky, float32 [count, 6, n, n].
     """
-    maps = _empty_maps(scene, centres, axes, radiance.shape[2], levels=False)
+    maps = empty_maps(scene, centres, axes, radiance.shape[2])
     maps.view.radiance.assign(np.ascontiguousarray(radiance, np.float32).reshape(-1, 4))
     maps.view.distance.assign(np.ascontiguousarray(distance, np.float32).reshape(-1))
     maps.view.triangle = wp.empty(0, dtype=int, device=scene.device)
@@ -466,21 +464,8 @@ def look_up(
     return radiance
 
 
-def stands_in_a_body(scene: Scene, maps: CubeMaps, k: int) -> bool:
-    """Whether most of what a map sees are closed bodies from within: its eye is inside a wall."""
-    triangle = maps.triangle(k).reshape(-1)[::BEHIND_STRIDE]
-    covered = triangle >= 0
-    if not covered.any():
-        return False
-    triangle = triangle[covered]
-    corners = scene.host_points[scene.host_triangles[triangle]].astype(np.float64)
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    outward = corners[:, 0] - (maps.centres[k] - scene.origin)
-    closed = scene.closed_patches.numpy()[scene.host_triangle_patch[triangle]] == 1
-    return float(np.mean(closed & (np.einsum("ij,ij->i", normal, outward) > 0.0))) > BEHIND_SHARE
-
-
-def _empty_maps(scene: Scene, centres: np.ndarray, axes: np.ndarray, resolution: int, levels: bool) -> CubeMaps:
+def empty_maps(scene: Scene, centres: np.ndarray, axes: np.ndarray, resolution: int, levels: bool = False) -> CubeMaps:
+    """Maps to be filled; arguments as for `render_maps`."""
     sizes = [resolution]
     while levels and sizes[-1] > 1:
         sizes.append(sizes[-1] // 2)
@@ -510,7 +495,15 @@ def _copied(view: CubeMapsView) -> CubeMapsView:
     return other
 
 
-def _face_camera(scene: Scene, centre: np.ndarray, axes: np.ndarray, face: int, resolution: int) -> Camera:
+def face_camera(scene: Scene, centre: np.ndarray, axes: np.ndarray, face: int, resolution: int) -> Camera:
+    """The camera whose picture is a face of a map.
+
+    Args:
+        scene: Its near and far planes leave nothing of it out.
+        centre, axes: Of the map, world, see `CubeMaps`.
+        face: 0 to 5.
+        resolution: Texels along an edge.
+    """
     right, up, forward = RADIANCE_AXES[face] @ axes.T
     _, _, corners = scene.boxes
     eye = centre - scene.origin
@@ -522,27 +515,38 @@ def _face_camera(scene: Scene, centre: np.ndarray, axes: np.ndarray, face: int, 
 
 
 def _draw_face(scene, camera, maps, k, face, without, onward, shadows, threads) -> None:
-    """Draw, shade and store one face.
-
-    What the texels see is shaded as the layer of a mirror that stands at the hits themselves: the cone of a texel that
-    textures are looked up with has come that far.
-    """
+    """Draw, shade and store one face."""
     device, count = scene.device, camera.size[0] * camera.size[1]
     gbuffer = raster.draw_scene(scene, camera, threads, without)
     point, direction = (wp.zeros(count, dtype=wp.vec3, device=device) for _ in range(2))
     u, v, distance = (wp.zeros(count, dtype=float, device=device) for _ in range(3))
     inputs = [scene.view, gbuffer.view, gbuffer.triangle, point, direction, u, v, distance]
     launch.launch(texel_hits_kernel, count, inputs, device, threads)
-    pixel = wp.array(np.arange(count, dtype=np.int32), dtype=int, device=device)
-    pixels = MirrorPixels(0, pixel, point, direction, direction, (0, 0, *camera.size))
-    layer = ReflectionLayer.empty(pixels, Technique.ENVIRONMENT, device)
-    layer.triangle, layer.u, layer.v = gbuffer.triangle, u, v
+    layer = hits_layer(point, direction, gbuffer.triangle, u, v)
     radiance = shade.seen_radiance(scene, gbuffer, layer, threads, shadows)
     if onward is not None:
         onward(gbuffer, layer, radiance)
     view = maps.view
     places = [k * view.map_texels + face * count, (k * FACE_COUNT + face) * count]
     launch.launch(store_texels_kernel, count, [gbuffer.triangle, radiance, distance, *places, view], device, threads)
+
+
+def hits_layer(point: wp.array, direction: wp.array, triangle: wp.array, u: wp.array, v: wp.array) -> ReflectionLayer:
+    """What texels see as the layer of a mirror that stands at the hits themselves, to be shaded.
+
+    The cone that textures are looked up with has come that far from the eye of the G-buffer it is shaded with.
+
+    Args:
+        point: The hits, vec3, scene frame.
+        direction: Of the rays that met them, unit.
+        triangle, u, v: As in `ReflectionLayer`.
+    """
+    device, count = triangle.device, len(triangle)
+    pixel = wp.array(np.arange(count, dtype=np.int32), dtype=int, device=device)
+    pixels = MirrorPixels(0, pixel, point, direction, direction, (0, 0, 0, 0))
+    layer = ReflectionLayer.empty(pixels, Technique.ENVIRONMENT, device)
+    layer.triangle, layer.u, layer.v = triangle, u, v
+    return layer
 
 
 def _packed_map(maps: CubeMaps, k: int) -> tuple[np.ndarray, PackedRange, np.ndarray]:

@@ -21,6 +21,7 @@ from warp_reflect.shadows import Shadows
 from warp_reflect.techniques import MAPS, TECHNIQUES
 
 METHODS = ("auto", "reference", "none")
+OF_ALL_TIMES = ("layered_environment",)  # prepare something that holds nothing that moves
 REUSING = ("quadric", "reflector_map")  # know a bound on how far a virtual vertex drifts
 DEFAULT_SIZE = (960, 540)  # usdrecord's default width at 16:9
 # Of the time asked for: between them a frame's time changes nothing.
@@ -353,7 +354,11 @@ def prefer_forward(plan: Plan, earlier: Plan | None = None) -> Plan:
 
 def _take_over(made: Plan, earlier: Plan | None) -> None:
     """Hand over what an earlier plan's techniques prepared, where it is still that."""
-    if earlier is None or not earlier.scene.shares_world(made.scene):
+    if earlier is None:
+        return
+    if not earlier.scene.shares_world(made.scene):
+        for name in {row.technique for row in made.rows} & set(OF_ALL_TIMES):
+            TECHNIQUES[name].take_over(earlier.scene, made.scene)
         return
     before = {row.reflector: row for row in earlier.rows}
     for row in made.rows:
@@ -400,6 +405,9 @@ def _row(scene, camera, settings, method, number, part_index, part, weight, pixe
     technique, forced, reason = _technique(scene, reflector, camera, method, pixels, settings, part, notes, costs)
     if method == "reference":
         settings = settings.replace(refine="off")
+    if technique == "layered_environment" and pixels:
+        told = TECHNIQUES[technique].plan_notes(scene, reflector, settings)
+        notes += [note for note in told if note not in notes]
     return PlanRow(
         reflector,
         part.prim_path,

@@ -92,6 +92,7 @@ class InstanceData:
     prim_path: str
     materials: tuple[int, ...]  # one per part, index into SceneData.materials
     instance: str = ""  # which copy, where several share prim_path (point instancers)
+    moves: bool = False  # something of it may be otherwise at another time
 
 
 @dataclass(frozen=True)
@@ -471,6 +472,23 @@ class Scene:
         return self._part_tracers[part]
 
     @cached_property
+    def moving_parts(self) -> tuple[int, ...]:
+        """Indices of the parts whose prims may be otherwise at another time."""
+        return tuple(k for k, part in enumerate(self.parts) if self.data.instances[part.prim - 1].moves)
+
+    @cached_property
+    def still_tracer(self):
+        """The owner of the structure (`bvh.Tracer`) over all but the moving parts, built at first use."""
+        from warp_reflect import bvh
+
+        if not self.moving_parts:
+            return self.tracer
+        still = np.ones(self.triangle_count, bool)
+        for part in (self.parts[k] for k in self.moving_parts):
+            still[part.first_triangle : part.first_triangle + part.triangle_count] = False
+        return bvh.Tracer(self, seen=still)
+
+    @cached_property
     def lights(self):
         """The lights as kernels read them (`shade.LightView`), prepared at first use."""
         from warp_reflect import shade
@@ -659,6 +677,11 @@ def same_world(a: SceneData, b: SceneData) -> bool:
         and _same(a.lights, b.lights)
         and _same(a.pictures, b.pictures)
     )
+
+
+def same_lights(a: Scene, b: Scene) -> bool:
+    """Whether two scenes are lit alike."""
+    return _same(a.data.lights, b.data.lights)
 
 
 def _same(a, b) -> bool:

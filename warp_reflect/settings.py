@@ -62,6 +62,8 @@ REFINEMENTS = ("exact", "strict", "off")
 OCCLUSIONS = ("exact", "painter")
 SWITCHED = ("shadows", "dome_shadows")  # settings that take a boolean for on and off
 SWITCHES = {"1": "on", "true": "on", "on": "on", "0": "off", "false": "off", "off": "off"}
+REM_TEXELS = ("packed", "full")
+REM_MISSING = ("shade", "best")
 ENVIRONMENT_UPDATES = ("static", "frame", "previous")
 FIELDS = ("auto", "heightfield", "occupancy")
 GLOSSY = ("filter", "accumulate", "off")
@@ -116,6 +118,22 @@ class Settings:
     environment_update: str = "static"
     """A mirror's environment map is drawn: `static` (again only where the world changed), `frame` (in every frame), or
     `previous` (in every frame, and mirrors seen in it show the maps of the frame before)."""
+    rem_count: int = 2
+    """Reference environment maps that a texel of a local map is blended from."""
+    rem_texels: str = "packed"
+    """Texels of reference environment maps: `packed` (4 bytes) or `full` (24 bytes, single precision)."""
+    rem_missing: str = "shade"
+    """What no reference map sees is shaded where it is met (`shade`), or shows the map that would weigh most (`best`)."""
+    rem_limit: int = 16
+    """Reference maps that are placed at most where the stage names no places."""
+    rem_error_px: float = 1.0
+    """Reference maps are placed until their predicted error is below this. [texels of a local map]"""
+    mesh_cells: int = 32
+    """Cells along a face of a local map's mesh before it is refined, at least."""
+    depth_ratio: float = 0.25
+    """A cell whose corners' depths differ by more than this share of the nearest is refined; 0: every texel is traced."""
+    parallax_steps: int = 3
+    """Steps from a mirror's pixel to what its ray meets in a local map; 0: looked up by direction alone."""
     walk_hops: int = 4
     """Neighbour triangles a refinement may walk over before the BVH decides."""
     complexity: str = "low"
@@ -191,6 +209,14 @@ class Settings:
         )
         depth = self.transparency_depth
         _require(0 <= depth <= 64, "transparency_depth", depth, "0 to 64 surfaces")
+        _require(1 <= self.rem_count <= 8, "rem_count", self.rem_count, "1 to 8")
+        _require(self.rem_texels in REM_TEXELS, "rem_texels", self.rem_texels, f"one of {', '.join(REM_TEXELS)}")
+        _require(self.rem_missing in REM_MISSING, "rem_missing", self.rem_missing, f"one of {', '.join(REM_MISSING)}")
+        _require(1 <= self.rem_limit <= 1024, "rem_limit", self.rem_limit, "1 to 1024")
+        _require(0.0 <= self.rem_error_px <= 1.0e6, "rem_error_px", self.rem_error_px, "a number of texels")
+        _require(1 <= self.mesh_cells <= 4096, "mesh_cells", self.mesh_cells, "1 to 4096")
+        _require(0.0 <= self.depth_ratio <= 1.0e6, "depth_ratio", self.depth_ratio, "0 (all texels) or a ratio")
+        _require(0 <= self.parallax_steps <= 64, "parallax_steps", self.parallax_steps, "0 to 64")
         _require(0 <= self.walk_hops <= 64, "walk_hops", self.walk_hops, "0 to 64")
         _require(self.field_kind in FIELDS, "field_kind", self.field_kind, f"one of {', '.join(FIELDS)}")
         _require(0.0 <= self.field_cell <= 1.0e9, "field_cell", self.field_cell, "0 (automatic) or a length")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from pxr import Tf, Usd, UsdGeom
@@ -20,6 +20,11 @@ ANALYTIC = ("Sphere", "Cube", "Cylinder", "Cylinder_1", "Cone", "Capsule", "Caps
 DRAWN = frozenset(("Mesh", "Points", *ANALYTIC))
 
 
+def _varies(prim) -> bool:
+    """Whether anything of a prim itself may change in time."""
+    return any(attribute.ValueMightBeTimeVarying() for attribute in prim.GetAuthoredAttributes())
+
+
 @dataclass(frozen=True)
 class State:
     """What a prim inherits from the prims above it."""
@@ -28,6 +33,7 @@ class State:
     visible: bool = True
     purpose: str = "default"
     inside_instancer: bool = False
+    moves: bool = False
 
 
 @dataclass
@@ -125,7 +131,9 @@ class Walk:
                     world = state.world_from_parent @ world
             elif state.inside_instancer:
                 self.intake.note(prim.GetPath(), "xformOpOrder: !resetXformStack! stops at the point instancer")
-            state = State(world, visible, purpose, state.inside_instancer)
+            moves = state.moves or imageable.GetVisibilityAttr().ValueMightBeTimeVarying()
+            moves = moves or (prim.IsA(UsdGeom.Xformable) and UsdGeom.Xformable(prim).TransformMightBeTimeVarying())
+            state = State(world, visible, purpose, state.inside_instancer, moves)
         kind = prim.GetTypeName()
         schemas = applied(prim)
         if MIRROR_API in schemas:
@@ -189,7 +197,8 @@ class Walk:
         if path not in self._drawn_index:
             self._drawn_index[path] = len(self.drawn)
             self.drawn.append(prim)
-        found.append(InstanceData(self._drawn_index[path], state.world_from_parent, path, ()))
+        moves = state.moves or _varies(prim)
+        found.append(InstanceData(self._drawn_index[path], state.world_from_parent, path, (), moves=moves))
 
     def _instancer(self, prim, state: State, found: list[InstanceData]) -> None:
         path = str(prim.GetPath())
@@ -198,11 +207,14 @@ class Walk:
         except BadPrim as fault:
             self.intake.bad(path, f"{fault}; instancer dropped")
             return
+        moves = state.moves or _varies(prim)
         for k, target in enumerate(targets):
             chosen = np.flatnonzero(prototype == k)
             if not len(chosen):
                 continue
             items = self._prototype(prim, target, state.purpose)
+            if moves:
+                items = [replace(item, moves=True) for item in items]
             if len(items) * len(chosen) + len(found) > self.intake.limits.instances:
                 raise ValueError(f"<{path}>: more than {self.intake.limits.instances} instances; raise the limit")
             worlds = state.world_from_parent @ transforms[chosen]

@@ -143,27 +143,15 @@ def parallax_px(scene: Scene, reflector, camera: Camera, threads: int = 0) -> fl
     Returns:
         The error below which `QUANTILE` of the mirror's pixels stay; 0 where it is not seen.
     """
-    shrink = max(1.0, max(camera.size) / PREVIEW_SIDE)
-    size = tuple(max(1, round(side / shrink)) for side in camera.size)
-    scaled = {name: getattr(camera, name) / shrink for name in ("fx", "fy", "cx", "cy")}
-    small = dataclasses.replace(camera, size=size, **scaled)
-    gbuffer = raster.draw_scene(scene, small, threads)
-    found, _ = surface.mirror_pixels(scene, gbuffer, {reflector.id: reflector.part}, threads)
-    pixels = found[reflector.id]
-    if not pixels.count or not scene.tracer.id:
+    number, point, ray, width, shrink = _preview(scene, reflector, camera, threads)
+    if not len(number) or not scene.tracer.id:
         return 0.0
-    number = pixels.pixel.numpy()
-    point, ray = pixels.point.numpy().astype(np.float64), pixels.direction.numpy().astype(np.float64)
     centre = centre_of(scene, reflector.part) - scene.origin
     origins = np.tile(centre, (len(ray), 1))
     body = bvh.body_of(scene, reflector.part, convex=True)
     triangle, distance, _, _ = scene.mirror_tracer(reflector.part).trace(origins, ray, threads, body)
     shown = centre + distance.numpy()[:, None].astype(np.float64) * ray
-    # Index of the pixels to the right and below.
-    place = np.full(size[0] * size[1] + size[0] + 1, -1)
-    place[number] = np.arange(len(number))
-    right = np.where((number + 1) % size[0] != 0, place[number + 1], -1)
-    below = place[number + size[0]]
+    right, below = _neighbours(number, width)
     asked = (triangle.numpy() >= 0) & (right >= 0) & (below >= 0)
     if not asked.any():
         return 0.0
@@ -184,5 +172,25 @@ def parallax_px(scene: Scene, reflector, camera: Camera, threads: int = 0) -> fl
     safe = np.where(good, det, 1.0)
     step = np.hypot((c * d - b * e) / safe, (a * e - b * d) / safe)
     # Where neighbours' rays do not part, the picture is one direction wide: all of it is off.
-    step = np.where(good, step, np.where((here * here).sum(axis=1) > 0.0, max(size), 0.0))
-    return float(min(np.quantile(step, QUANTILE), max(size)) * shrink)
+    step = np.where(good, step, np.where((here * here).sum(axis=1) > 0.0, width, 0.0))
+    return float(min(np.quantile(step, QUANTILE), width) * shrink)
+
+
+def _preview(scene: Scene, reflector, camera: Camera, threads: int):
+    """A small picture of a mirror: its pixels' numbers, points, reflected rays; the picture's width; how often it is smaller."""
+    shrink = max(1.0, max(camera.size) / PREVIEW_SIDE)
+    size = tuple(max(1, round(side / shrink)) for side in camera.size)
+    scaled = {name: getattr(camera, name) / shrink for name in ("fx", "fy", "cx", "cy")}
+    small = dataclasses.replace(camera, size=size, **scaled)
+    gbuffer = raster.draw_scene(scene, small, threads)
+    found, _ = surface.mirror_pixels(scene, gbuffer, {reflector.id: reflector.part}, threads)
+    pixels = found[reflector.id]
+    point, ray = (array.numpy().astype(np.float64) for array in (pixels.point, pixels.direction))
+    return pixels.pixel.numpy(), point, ray, size[0], shrink
+
+
+def _neighbours(number: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
+    """For ascending pixel numbers the index of the pixel to the right and of the one below, -1 where there is none."""
+    place = np.full(int(number.max()) + width + 2, -1)
+    place[number] = np.arange(len(number))
+    return np.where((number + 1) % width != 0, place[number + 1], -1), place[number + width]

@@ -1,0 +1,236 @@
+"""A local environment map at every mirror's centre, blended from reference environment maps: many moving mirrors, no rendering.
+
+Source: Meyer and Loscos, Real-Time Reflection on Moving Vehicles in Urban Environments, VRST 2003. `reference_maps.py` has
+the maps, `local_map.py` the local map. Differs from it by: a mirror's pixel is not looked up by its reflected direction
+alone, but by where its own ray meets what the local map holds, found in a few steps from texel to texel (after
+Szirmay-Kalos et al., Approximate Ray-Tracing on the GPU with Distance Impostors, Eurographics 2005; here against the plane
+of the triangle that the texel holds, exact where it settles).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from time import perf_counter
+
+import numpy as np
+import warp as wp
+
+from warp_reflect import bvh, launch
+from warp_reflect.environment_maps import CubeMaps, CubeMapsView, fetch_radiance, nearest_texel
+from warp_reflect.layers import Camera, GBuffer, MirrorPixels, ReflectionLayer
+from warp_reflect.scene import Note, Scene, SceneView
+from warp_reflect.settings import Settings, Status, Technique
+from warp_reflect.shade import LightView
+from warp_reflect.shapes import clamp_weights, intersect_triangle, unit
+from warp_reflect.techniques import local_map, reference_maps
+from warp_reflect.techniques.environment import centre_of
+from warp_reflect.techniques.reference_maps import ReferenceMaps, take_over
+
+__all__ = ["applies", "plan_notes", "prepare", "reflect", "take_over"]
+
+wp.set_module_options({"enable_backward": False})
+
+CONVERGED = wp.constant(int(Status.CONVERGED))
+SKY = wp.constant(int(Status.SKY))
+CANDIDATES_PER_MAP = 2  # maps that are looked at for each that is blended, where more than two are
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A mirror's local map at `centre` (world, float64 [3]), and what building it met."""
+
+    part: int
+    centre: np.ndarray
+    references: ReferenceMaps
+    local: CubeMaps
+    statistics: dict = field(default_factory=dict)
+    timings: dict = field(default_factory=dict)
+
+
+def applies(scene: Scene, reflector) -> tuple[bool, str]:
+    """A local map asks nothing of a mirror."""
+    named = len(scene.data.environment_maps)
+    maps = f"{named} reference maps" if named else "reference maps placed along the paths of the mirrors"
+    return True, f"a local map is blended from {maps}"
+
+
+def plan_notes(scene: Scene, reflector, settings: Settings) -> list[Note]:
+    """Notes for a plan: maps that cannot be used, mirrors beyond them, memory."""
+    usable, notes = reference_maps.usable_places(scene, settings)
+    notes, part = list(notes), scene.parts[reflector.part]
+    if usable:
+        centres = reference_maps.authored(scene).centres[usable]
+        notes += _beyond(scene, reflector.part, centres, reference_maps.reach_of(centres))
+        if len(centres) == 1 and settings.rem_count > 1:
+            notes.append(Note(part.prim_path, "there is one environment map: what it does not see is not blended"))
+    elif scene.data.environment_maps:
+        notes.append(
+            Note("/", "none of its environment maps can be used: maps are placed along the paths of its mirrors")
+        )
+    megabytes = reference_maps.predicted_bytes(scene, settings) / 1e6
+    most = "" if usable else "at most "
+    count = len(usable) or settings.rem_limit
+    notes.append(
+        Note(
+            "/",
+            f"{most}{count} reference environment maps: {most}{megabytes:.1f} MB, shared by all mirrors (rem_texels)",
+        )
+    )
+    return notes
+
+
+def prepare(scene: Scene, reflector, settings: Settings) -> Prepared:
+    """Build the mirror's local map; the scene's reference maps are drawn at first use."""
+    part = reflector.part
+    references = reference_maps.reference_maps(scene, settings)
+    centre = centre_of(scene, part)
+    start = perf_counter()
+    intersect = intersect_scene(scene, part, centre, settings.threads)
+    mesh = local_map.trace_depth_mesh(
+        settings.environment_resolution,
+        intersect,
+        settings.mesh_cells,
+        settings.depth_ratio,
+        scene.device,
+        settings.threads,
+    )
+    traced = perf_counter()
+    rems = nearest_maps(references, centre, settings.rem_count)
+    local, statistics = local_map.blend_local_map(scene, centre, mesh, intersect, references.maps, rems, settings)
+    timings = {"local_rays": 1e3 * (traced - start), "local_blend": 1e3 * (perf_counter() - traced)}
+    beyond = _beyond(scene, part, references.placement.centres, references.reach)
+    scene.notes += [note for note in beyond if note not in scene.notes]
+    return Prepared(part, centre, references, local, mesh.statistics | statistics, timings)
+
+
+def intersect_scene(scene: Scene, part: int, centre: np.ndarray, threads: int) -> local_map.Intersect:
+    """Rays from a mirror's centre through the scene's BVH, the mirror itself left out: exact."""
+    origin = centre - scene.origin
+    body = bvh.body_of(scene, part, convex=True)
+    tracer = scene.mirror_tracer(part)
+
+    def intersect(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        triangle, t, _, _ = tracer.trace(np.tile(origin, (len(directions), 1)), directions, threads, body)
+        return np.where(triangle.numpy() >= 0, t.numpy(), np.float32(0.0)), triangle.numpy()
+
+    return intersect
+
+
+def nearest_maps(references: ReferenceMaps, centre: np.ndarray, count: int) -> np.ndarray:
+    """Numbers of the reference maps that a local map looks at, the nearest first."""
+    looked_at = count if count <= 2 else min(CANDIDATES_PER_MAP * count, local_map.REMS_MAX)
+    distance = np.linalg.norm(references.placement.centres - centre, axis=1)
+    return np.argsort(distance, kind="stable")[:looked_at]
+
+
+def _beyond(scene: Scene, part: int, centres: np.ndarray, reach: float) -> list[Note]:
+    nearest = float(np.linalg.norm(centres - centre_of(scene, part), axis=1).min())
+    if nearest <= reach:
+        return []
+    text = f"{nearest:.3g} from the nearest environment map, which are {reach:.3g} apart: its reflection may be coarse"
+    return [Note(scene.parts[part].prim_path, text)]
+
+
+@wp.kernel
+def look_up_kernel(
+    first: int,
+    scene: SceneView,
+    lights: LightView,
+    local: CubeMapsView,
+    steps: int,
+    point: wp.array(dtype=wp.vec3),
+    direction: wp.array(dtype=wp.vec3),
+    # Outputs:
+    out_triangle: wp.array(dtype=int),
+    out_u: wp.array(dtype=float),
+    out_v: wp.array(dtype=float),
+    out_distance: wp.array(dtype=float),
+    out_status: wp.array(dtype=wp.uint8),
+    out_radiance: wp.array(dtype=wp.vec3),
+    out_settled: wp.array(dtype=wp.uint8),
+):
+    """One thread per mirror pixel: from texel to texel to where its ray meets what the local map holds."""
+    i = first + wp.tid()
+    ray = direction[i]
+    start = point[i] - local.centre[0]
+    towards = ray
+    texel = nearest_texel(local, 0, towards)
+    t = local.distance[texel]
+    settled = int(0)
+    step = int(0)
+    while step < steps and settled == 0 and local.distance[texel] > 0.0:
+        step += 1
+        along = float(-1.0)
+        triangle = local.triangle[texel]
+        if triangle >= 0:
+            corner = scene.triangles[triangle]
+            hit = intersect_triangle(
+                point[i], ray, scene.points[corner[0]], scene.points[corner[1]], scene.points[corner[2]]
+            )
+            if hit.det != 0.0:
+                along = hit.t
+                if hit.hit == 1 and hit.t > 0.0:
+                    settled = int(1)
+                    out_u[i] = hit.u
+                    out_v[i] = hit.v
+                    out_triangle[i] = triangle
+        if along <= 0.0:
+            # Past the plane: the sphere of the texel's distance around the centre.
+            middle = wp.dot(start, ray)
+            inside = local.distance[texel] * local.distance[texel] - wp.dot(start, start) + middle * middle
+            along = wp.sqrt(wp.max(inside, 0.0)) - middle
+        if along > 0.0 and wp.isfinite(along):
+            t = along
+            towards = start + t * ray
+            texel = nearest_texel(local, 0, towards)
+        elif settled == 0:
+            step = steps
+    if settled == 0:
+        triangle = local.triangle[texel]
+        if local.distance[texel] == 0.0:
+            # What is passed on the way to the sky is where it was looked for last.
+            triangle = -1
+            t = 0.0
+        out_triangle[i] = triangle
+        if triangle >= 0:
+            corner = scene.triangles[triangle]
+            hit = intersect_triangle(
+                point[i], ray, scene.points[corner[0]], scene.points[corner[1]], scene.points[corner[2]]
+            )
+            weights = clamp_weights(hit.u, hit.v)
+            if hit.det == 0.0:
+                weights = wp.vec2(1.0 / 3.0, 1.0 / 3.0)
+            out_u[i] = weights[0]
+            out_v[i] = weights[1]
+        if triangle < 0:
+            towards = wp.where(local.distance[texel] == 0.0, ray, towards)
+    out_distance[i] = t
+    out_status[i] = wp.uint8(wp.where(out_triangle[i] >= 0, CONVERGED, SKY))
+    out_radiance[i] = fetch_radiance(local, lights, 0, unit(towards), 0.0)
+    out_settled[i] = wp.uint8(settled)
+
+
+def reflect(
+    scene: Scene,
+    prepared: Prepared,
+    gbuffer: GBuffer,
+    pixels: MirrorPixels,
+    camera: Camera,
+    settings: Settings,
+    history=None,
+) -> ReflectionLayer:
+    """Look every mirror pixel up in the mirror's local map.
+
+    Returns:
+        A layer with `radiance` and status CONVERGED or SKY. Statistics: those of the local map (`local_rays`,
+        `local_discontinuities` and `..._traced`, `rem_texels`, `rem_missing`, `rem_shaded`) and `local_settled`: pixels whose
+        ray was found to hit the very triangle that the map holds.
+    """
+    layer = ReflectionLayer.empty(pixels, Technique.LAYERED_ENVIRONMENT, scene.device)
+    layer.radiance = wp.empty(pixels.count, dtype=wp.vec3, device=scene.device)
+    settled = wp.zeros(pixels.count, dtype=wp.uint8, device=scene.device)
+    inputs = [scene.view, scene.lights, prepared.local.view, settings.parallax_steps, pixels.point, pixels.direction]
+    inputs += [layer.triangle, layer.u, layer.v, layer.distance, layer.status, layer.radiance, settled]
+    launch.launch(look_up_kernel, pixels.count, inputs, scene.device, settings.threads)
+    layer.statistics = prepared.statistics | {"local_settled": int(settled.numpy().sum())}
+    return layer

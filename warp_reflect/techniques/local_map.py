@@ -1,0 +1,567 @@
+"""The local environment map of a mirror out of reference environment maps (REMs): no rendering of the scene.
+
+Source: Meyer and Loscos, Real-Time Reflection on Moving Vehicles in Urban Environments, VRST 2003, sections 4.1 to 4.4.
+A mesh over every face of a cube around the mirror's centre is refined where the depths at a cell's corners differ; the rays
+of its nodes meet the scene at points I, and the texel in the direction of I is blended from the REMs that see I. Differs
+from it by:
+
+* nodes are the texels' centres, so a mesh refined to the end holds every discontinuity that it met exactly; between nodes
+  the inverse of the depth along the face's axis is interpolated, which is affine on planes;
+* the position of I along the axis of two REMs counts with its sign: the paper's unsigned distances give weights whose sum
+  is not 1 beyond the axis' ends;
+* the depth test has slack in proportion to a texel's footprint on the surface at I (its distances are float32, the paper's
+  8 bits), so that a surface does not fail it against itself;
+* for more than two REMs the weights of Buehler et al., Unstructured Lumigraph Rendering, SIGGRAPH 2001, section 4.2;
+* what no REM sees can be shaded where it is met.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cache
+
+import numpy as np
+import warp as wp
+
+from warp_reflect import launch, shade
+from warp_reflect.cubemap import FACE_COUNT, radiance_direction, texel_directions
+from warp_reflect.environment_maps import (
+    CubeMaps,
+    CubeMapsView,
+    empty_maps,
+    face_camera,
+    fetch_covered,
+    hits_layer,
+    nearest_texel,
+    texel_distance,
+)
+from warp_reflect.layers import GBuffer
+from warp_reflect.scene import Scene, SceneView
+from warp_reflect.settings import Settings
+from warp_reflect.shade import LightView, dome_radiance
+from warp_reflect.shapes import clamp_weights, facet_normal, intersect_triangle
+
+wp.set_module_options({"enable_backward": False})
+
+REMS_MAX = 8  # maps that a local map may look at
+_weights = wp.types.vector(length=REMS_MAX, dtype=wp.float32)
+
+# The depth test's slack: texels' footprint on the surface, and rounding (algorithms: 0.3 to 2 % of the visible fail it).
+SLOPE_TEXELS = wp.constant(0.75)
+SLOPE_MAX = wp.constant(8.0)  # tangent of the angle at which the footprint stops to grow
+DEPTH_SLACK = wp.constant(0.002)  # of the distance
+COINCIDENT = wp.constant(1.0e-12)  # squared distance of two REMs, of the point's, at which they have no axis
+AT_CENTRE = wp.constant(
+    1.0e-12
+)  # squared distance of a point from a REM, of the local map's, at which it has no direction
+LEAST_WEIGHT = wp.constant(1.0e-6)  # weights that add up to less are one map's alone: no division by what rounding left
+PENALTY_FLOOR = wp.constant(1.0e-4)  # keeps a REM that sees a point from exactly there finite
+SCALE_PENALTY = wp.constant(0.2)  # per doubled distance, against an angle in radians
+RATIO_TOLD = 0.25  # of depths that count as discontinuities where all texels are traced
+INVERSE_MAX = 1.0e30  # inverse depth of a point at the centre itself
+
+# Of a texel after resampling.
+TEXEL_SKY = 0
+TEXEL_BLENDED = 1
+TEXEL_MISSING = 2  # no REM sees its point
+
+# (directions float32 [n, 3]) -> (distance float32 [n], 0 where there is only sky; triangle int32 [n], -1 likewise, or
+# where it is not known)
+Intersect = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+
+@dataclass
+class DepthMesh:
+    """What the rays of a local map met, at every texel.
+
+    Attributes:
+        inverse: Inverse depth along the face's axis, 0 sky, float32 [6, n, n].
+        triangle: Of the ray, or of the nearest node's; -1 sky or unknown, int32 [6, n, n].
+        traced: Whether it has a ray of its own, bool [6, n, n].
+        statistics: `local_rays`, `local_discontinuities` (neighbouring texels at depths apart by more than the ratio),
+            `local_discontinuities_traced` (those of which both have rays of their own).
+    """
+
+    inverse: np.ndarray
+    triangle: np.ndarray
+    traced: np.ndarray
+    statistics: dict = field(default_factory=dict)
+
+    @classmethod
+    def empty(cls, resolution: int) -> DepthMesh:
+        shape = (FACE_COUNT, resolution, resolution)
+        return cls(np.zeros(shape, np.float32), np.full(shape, -1, np.int32), np.zeros(shape, bool))
+
+    def trace(self, texels: np.ndarray, intersect: Intersect) -> np.ndarray:
+        """Give texels (flat indices, each once) rays of their own; returns their inverse distances, 0 sky, float32."""
+        axis_directions, lengths = _texel_rays(self.inverse.shape[1])
+        length = lengths[texels]
+        distance, triangle = intersect(axis_directions[texels] / length[:, None])
+        with np.errstate(divide="ignore", over="ignore"):
+            near = np.minimum(np.float32(1.0) / distance, np.float32(INVERSE_MAX))
+        # A distance of 0 on a triangle is a point at the centre, without one the sky.
+        radial = np.where((distance > 0.0) | (triangle >= 0), near, np.float32(0.0))
+        self.inverse.reshape(-1)[texels] = np.minimum(radial * length, INVERSE_MAX)
+        self.triangle.reshape(-1)[texels] = triangle
+        self.traced.reshape(-1)[texels] = True
+        self.statistics["local_rays"] = self.statistics.get("local_rays", 0) + len(texels)
+        return radial
+
+
+@cache
+def _texel_rays(resolution: int) -> tuple[np.ndarray, np.ndarray]:
+    """Directions of a map's texels at length 1 along their face's axis, float32 [6 n n, 3], and their lengths."""
+    directions = texel_directions(resolution).reshape(-1, 3)
+    return directions.astype(np.float32), np.linalg.norm(directions, axis=1).astype(np.float32)
+
+
+@wp.kernel
+def fill_cells_kernel(
+    first: int,
+    resolution: int,
+    cells: wp.array(dtype=wp.vec4i),
+    traced: wp.array(dtype=wp.uint8),
+    # Changed:
+    out_inverse: wp.array(dtype=float),
+    out_triangle: wp.array(dtype=int),
+):
+    """One thread per cell (face, y, x, size): the texels between its corners; on its far edges only where no cell follows."""
+    i = first + wp.tid()
+    cell = cells[i]
+    n = resolution
+    x0 = cell[2]
+    y0 = cell[1]
+    x1 = wp.min(x0 + cell[3], n - 1)
+    y1 = wp.min(y0 + cell[3], n - 1)
+    base = cell[0] * n * n
+    a = base + y0 * n + x0
+    b = base + y0 * n + x1
+    c = base + y1 * n + x0
+    d = base + y1 * n + x1
+    last_x = wp.where(x1 == n - 1, x1, x1 - 1)
+    last_y = wp.where(y1 == n - 1, y1, y1 - 1)
+    for y in range(y0, last_y + 1):
+        fy = float(y - y0) / float(wp.max(y1 - y0, 1))
+        for x in range(x0, last_x + 1):
+            t = base + y * n + x
+            if int(traced[t]) == 0:
+                fx = float(x - x0) / float(wp.max(x1 - x0, 1))
+                top = (1.0 - fx) * out_inverse[a] + fx * out_inverse[b]
+                low = (1.0 - fx) * out_inverse[c] + fx * out_inverse[d]
+                out_inverse[t] = (1.0 - fy) * top + fy * low
+                nearest = wp.where(fy < 0.5, wp.where(fx < 0.5, a, b), wp.where(fx < 0.5, c, d))
+                out_triangle[t] = out_triangle[nearest]
+
+
+def trace_depth_mesh(
+    resolution: int, intersect: Intersect, cells: int, ratio: float, device, threads: int = 0
+) -> DepthMesh:
+    """Depths at every texel of a cube map, traced where they have to be.
+
+    Args:
+        resolution: Texels along a cube edge.
+        intersect: Follows rays from the centre.
+        cells: Cells along a face before refinement, at least.
+        ratio: A cell is refined where |Zi - Zj| / min(Zi, Zj) of its corners is above it; 0: every texel is traced.
+        device: For the filling.
+        threads: CPU threads; 0: one per core.
+    """
+    n = resolution
+    mesh = DepthMesh.empty(n)
+    leaves = np.zeros((0, 4), np.int32)
+    if ratio <= 0.0 or n < 3:
+        mesh.trace(np.arange(FACE_COUNT * n * n), intersect)
+    else:
+        leaves = _refine(mesh, intersect, cells, ratio)
+    arrays = [wp.array(mesh.inverse.reshape(-1), dtype=float, device=device)]
+    arrays += [wp.array(mesh.triangle.reshape(-1), dtype=int, device=device)]
+    known = wp.array(mesh.traced.reshape(-1).astype(np.uint8), dtype=wp.uint8, device=device)
+    ready = wp.array(np.ascontiguousarray(leaves, np.int32), dtype=wp.vec4i, device=device)
+    launch.launch(fill_cells_kernel, len(leaves), [n, ready, known, *arrays], device, threads)
+    mesh.inverse, mesh.triangle = (array.numpy().reshape(mesh.traced.shape) for array in arrays)
+    mesh.statistics |= _discontinuities(mesh, ratio if ratio > 0.0 else RATIO_TOLD)
+    return mesh
+
+
+def _refine(mesh: DepthMesh, intersect: Intersect, cells: int, ratio: float) -> np.ndarray:
+    """Trace the nodes of the mesh; the cells that stay, (face, y, x, size), int [n, 4]."""
+    n = mesh.inverse.shape[1]
+    radial = np.zeros(FACE_COUNT * n * n, np.float32)
+    size = 1
+    while 2 * size * cells <= n:
+        size *= 2
+    start = np.arange(0, n - 1, size)
+    grid = np.stack(np.meshgrid(np.arange(FACE_COUNT), start, start, indexing="ij"), -1).reshape(-1, 3)
+    done = []
+    while True:
+        face, y0, x0 = grid.T
+        y1, x1 = np.minimum(y0 + size, n - 1), np.minimum(x0 + size, n - 1)
+        corners = face * n * n + np.stack([y0 * n + x0, y0 * n + x1, y1 * n + x0, y1 * n + x1])
+        wanted = np.zeros(len(radial), bool)
+        wanted[corners] = True
+        asked = np.flatnonzero(wanted & ~mesh.traced.reshape(-1))
+        if len(asked):
+            radial[asked] = mesh.trace(asked, intersect)
+        if size == 1:
+            break
+        a, b, c, d = radial[corners]
+        most, least = np.maximum(np.maximum(a, b), np.maximum(c, d)), np.minimum(np.minimum(a, b), np.minimum(c, d))
+        # |Zi - Zj| / min > ratio in inverse depths; sky, at 0, splits from everything but sky.
+        split = most > (1.0 + ratio) * least
+        done.append(np.column_stack([grid[~split], np.full(int((~split).sum()), size)]))
+        size //= 2
+        steps = np.array([[0, 0, 0], [0, 0, size], [0, size, 0], [0, size, size]])
+        grid = (grid[split][:, None] + steps).reshape(-1, 3)
+        grid = grid[(grid[:, 1] < n - 1) & (grid[:, 2] < n - 1)]
+    return np.concatenate(done) if done else np.zeros((0, 4), np.int32)
+
+
+def _discontinuities(mesh: DepthMesh, ratio: float) -> dict[str, int]:
+    met = traced = 0
+    for axis in (1, 2):
+        first = [slice(None)] * 3
+        second = [slice(None)] * 3
+        first[axis], second[axis] = slice(None, -1), slice(1, None)
+        a, b = mesh.inverse[tuple(first)], mesh.inverse[tuple(second)]
+        apart = np.maximum(a, b) > (1.0 + ratio) * np.minimum(a, b)
+        met += int(apart.sum())
+        traced += int((apart & mesh.traced[tuple(first)] & mesh.traced[tuple(second)]).sum())
+    return {"local_discontinuities": met, "local_discontinuities_traced": traced}
+
+
+@wp.func
+def axis_share(p: wp.vec3, a: wp.vec3, b: wp.vec3) -> float:
+    """Where a point lies along the axis from a to b, 0 to 1; 1/2 where they coincide."""
+    axis = b - a
+    square = wp.dot(axis, axis)
+    to_point = p - a
+    if square <= COINCIDENT * wp.dot(to_point, to_point):
+        return 0.5
+    return wp.clamp(wp.dot(to_point, axis) / square, 0.0, 1.0)
+
+
+@wp.func
+def sees_point(maps: CubeMapsView, k: int, p: wp.vec3, normal: wp.vec3, slack: float) -> bool:
+    """Whether map k sees a point of a surface: nothing stands nearer in its direction.
+
+    Args:
+        maps: The maps.
+        k: Which.
+        p: Scene frame.
+        normal: Of the surface, unit; zero: unknown.
+        slack: Length by which p itself may be off its surface.
+    """
+    ray = p - maps.centre[k]
+    distance = wp.length(ray)
+    found = texel_distance(maps, k, nearest_texel(maps, k, ray))
+    if found == 0.0:
+        return True
+    tangent = SLOPE_MAX
+    cosine = wp.abs(wp.dot(normal, ray)) / distance
+    if cosine > 0.0:
+        tangent = wp.min(wp.sqrt(wp.max(1.0 - cosine * cosine, 0.0)) / cosine, SLOPE_MAX)
+    footprint = 2.0 * distance / float(maps.resolution)
+    return distance <= found + SLOPE_TEXELS * footprint * tangent + DEPTH_SLACK * distance + slack
+
+
+@wp.func
+def penalty(p: wp.vec3, eye: wp.vec3, centre: wp.vec3) -> float:
+    """How badly a REM at `centre` stands in for `eye` at a point: angle between them, and how much farther it is."""
+    a = eye - p
+    b = centre - p
+    near = wp.max(wp.length(a), 1.0e-30)
+    angle = wp.atan2(wp.length(wp.cross(a, b)), wp.dot(a, b))
+    return angle + SCALE_PENALTY * wp.max(0.0, wp.length(b) / near - 1.0) + PENALTY_FLOOR
+
+
+@wp.func
+def normalised(weights: _weights, count: int, valid: _weights, prior: _weights) -> _weights:
+    """Weights of the valid maps that add up to 1; without any, all to the one that weighed most before.
+
+    Args:
+        weights: 0 where a map is not used.
+        count: Maps in use.
+        valid: 1 where a map sees the point.
+        prior: Weights before validity was asked.
+    """
+    total = float(0.0)
+    best = int(-1)
+    most = float(-1.0)
+    best_prior = int(0)
+    most_prior = float(-1.0)
+    k = int(0)
+    while k < count:
+        total += weights[k]
+        if valid[k] > 0.0 and prior[k] > most:
+            most = prior[k]
+            best = k
+        if prior[k] > most_prior:
+            most_prior = prior[k]
+            best_prior = k
+        k += 1
+    if total > LEAST_WEIGHT:
+        return weights / total
+    result = _weights()
+    result[wp.where(best >= 0, best, best_prior)] = 1.0
+    return result
+
+
+@wp.func
+def rem_weights(
+    maps: CubeMapsView, rems: wp.array(dtype=int), used: int, eye: wp.vec3, p: wp.vec3, valid: _weights
+) -> _weights:
+    """Weights of the candidate maps at a point; they add up to 1.
+
+    Args:
+        maps: The reference maps.
+        rems: Numbers of the candidates, the nearest to the eye first.
+        used: How many are blended; with two the position along their axis decides, with more `penalty`.
+        eye: Centre of the local map.
+        p: The point, scene frame.
+        valid: 1 for each candidate that sees it.
+    """
+    count = rems.shape[0]
+    prior = _weights()
+    weights = _weights()
+    blended = count
+    if used == 1 or count == 1:
+        blended = 1
+        prior[0] = 1.0
+        weights[0] = valid[0]
+    elif used == 2 or count == 2:
+        blended = 2
+        share = axis_share(p, maps.centre[rems[0]], maps.centre[rems[1]])
+        prior[0] = 1.0 - share
+        prior[1] = share
+        weights[0] = prior[0] * valid[0]
+        weights[1] = prior[1] * valid[1]
+    else:
+        pen = _weights()
+        worst = float(0.0)
+        k = int(0)
+        while k < count:
+            pen[k] = penalty(p, eye, maps.centre[rems[k]])
+            prior[k] = 1.0 / pen[k]
+            worst = wp.max(worst, pen[k])
+            k += 1
+        # A weight is 0 from the (used + 1)-th smallest penalty on, of the maps that see the point.
+        bound = float(2.0) * worst
+        k = int(0)
+        while k < count:
+            smaller = int(0)
+            j = int(0)
+            while j < count:
+                if valid[j] > 0.0 and (pen[j] < pen[k] or (pen[j] == pen[k] and j < k)):
+                    smaller += 1
+                j += 1
+            if valid[k] > 0.0 and smaller == used:
+                bound = pen[k]
+            k += 1
+        k = int(0)
+        while k < count:
+            if valid[k] > 0.0 and pen[k] < bound:
+                weights[k] = (1.0 - pen[k] / bound) / pen[k]
+            k += 1
+    return normalised(weights, blended, valid, prior)
+
+
+@wp.kernel
+def blend_kernel(
+    first: int,
+    scene: SceneView,
+    lights: LightView,
+    maps: CubeMapsView,
+    rems: wp.array(dtype=int),
+    used: int,
+    eye: wp.vec3,
+    slack: float,
+    resolution: int,
+    index: wp.array(dtype=int),
+    inverse: wp.array(dtype=float),
+    triangle: wp.array(dtype=int),
+    # Outputs:
+    out_radiance: wp.array(dtype=wp.vec4),
+    out_distance: wp.array(dtype=float),
+    out_state: wp.array(dtype=wp.uint8),
+):
+    """One thread per texel; where `index` has a length, of those."""
+    i = first + wp.tid()
+    if index.shape[0] > 0:
+        i = index[i]
+    n = resolution
+    face = i / (n * n)
+    row = (i - face * n * n) / n
+    column = i - (face * n + row) * n
+    if inverse[i] <= 0.0:
+        out_radiance[i] = wp.vec4(0.0, 0.0, 0.0, 0.0)
+        out_distance[i] = 0.0
+        out_state[i] = wp.uint8(TEXEL_SKY)
+        return
+    u = (2.0 * float(column) + 1.0) / float(n) - 1.0
+    v = (2.0 * float(row) + 1.0) / float(n) - 1.0
+    local = radiance_direction(face, u, v) / inverse[i]
+    p = eye + local
+    distance = wp.length(local)
+    out_distance[i] = wp.max(distance, 1.0e-30)
+    normal = wp.vec3(0.0, 0.0, 0.0)
+    if triangle[i] >= 0:
+        corner = scene.triangles[triangle[i]]
+        normal = facet_normal(scene.points[corner[0]], scene.points[corner[1]], scene.points[corner[2]])
+    count = rems.shape[0]
+    asked = wp.where(used <= 2, wp.min(used, count), count)
+    valid = _weights()
+    any_valid = int(0)
+    k = int(0)
+    while k < asked:
+        ray = p - maps.centre[rems[k]]
+        if wp.dot(ray, ray) > AT_CENTRE * distance * distance and sees_point(maps, rems[k], p, normal, slack):
+            valid[k] = 1.0
+            any_valid = int(1)
+        k += 1
+    weights = rem_weights(maps, rems, used, eye, p, valid)
+    total = wp.vec3(0.0, 0.0, 0.0)
+    k = int(0)
+    while k < asked:
+        if weights[k] > 0.0:
+            ray = p - maps.centre[rems[k]]
+            if wp.dot(ray, ray) <= 0.0:
+                ray = local
+            value = fetch_covered(maps, rems[k], ray, 0.0)
+            seen = wp.vec3(value[0], value[1], value[2])
+            if value[3] < 0.999:
+                seen += (1.0 - value[3]) * dome_radiance(lights, wp.normalize(ray))
+            total += weights[k] * seen
+        k += 1
+    out_radiance[i] = wp.vec4(total[0], total[1], total[2], 1.0)
+    out_state[i] = wp.uint8(wp.where(any_valid == 1, TEXEL_BLENDED, TEXEL_MISSING))
+
+
+@wp.kernel
+def missing_hits_kernel(
+    first: int,
+    scene: SceneView,
+    eye: wp.vec3,
+    resolution: int,
+    texel: wp.array(dtype=int),
+    inverse: wp.array(dtype=float),
+    triangle: wp.array(dtype=int),
+    # Outputs:
+    out_point: wp.array(dtype=wp.vec3),
+    out_direction: wp.array(dtype=wp.vec3),
+    out_triangle: wp.array(dtype=int),
+    out_u: wp.array(dtype=float),
+    out_v: wp.array(dtype=float),
+):
+    """One thread per texel that is shaded at its own hit."""
+    i = first + wp.tid()
+    t = texel[i]
+    n = resolution
+    face = t / (n * n)
+    row = (t - face * n * n) / n
+    column = t - (face * n + row) * n
+    u = (2.0 * float(column) + 1.0) / float(n) - 1.0
+    v = (2.0 * float(row) + 1.0) / float(n) - 1.0
+    direction = wp.normalize(radiance_direction(face, u, v))
+    corner = scene.triangles[triangle[t]]
+    hit = intersect_triangle(eye, direction, scene.points[corner[0]], scene.points[corner[1]], scene.points[corner[2]])
+    weights = clamp_weights(hit.u, hit.v)
+    if hit.det == 0.0:
+        weights = wp.vec2(1.0 / 3.0, 1.0 / 3.0)
+    out_point[i] = eye + radiance_direction(face, u, v) / inverse[t]
+    out_direction[i] = direction
+    out_triangle[i] = triangle[t]
+    out_u[i] = weights[0]
+    out_v[i] = weights[1]
+
+
+@wp.kernel
+def put_radiance_kernel(
+    first: int, texel: wp.array(dtype=int), radiance: wp.array(dtype=wp.vec3), out_radiance: wp.array(dtype=wp.vec4)
+):
+    """One thread per texel that was shaded; a value that is not finite is black."""
+    i = first + wp.tid()
+    r = radiance[i]
+    if not (wp.isfinite(r[0]) and wp.isfinite(r[1]) and wp.isfinite(r[2])):
+        r = wp.vec3(0.0, 0.0, 0.0)
+    out_radiance[texel[i]] = wp.vec4(r[0], r[1], r[2], 1.0)
+
+
+def blend_local_map(
+    scene: Scene,
+    centre: np.ndarray,
+    mesh: DepthMesh,
+    intersect: Intersect,
+    maps: CubeMaps,
+    rems: np.ndarray,
+    settings: Settings,
+    slack: float = 0.0,
+) -> tuple[CubeMaps, dict[str, int]]:
+    """Colour the texels of a local map from reference maps.
+
+    A texel between the nodes of the mesh whose point no map sees gets a ray of its own first: mostly the mesh has missed
+    something there.
+
+    Args:
+        scene: Of the maps.
+        centre: Of the local map, world, float64 [3].
+        mesh: Its depths; those of texels that get rays are changed.
+        intersect: Follows rays from the centre.
+        maps: The reference maps.
+        rems: Numbers of those to be looked at, the nearest first, at most `REMS_MAX`.
+        settings: `rem_count`, `rem_missing`, `shadows`, `threads`.
+        slack: Length by which the depths may be off the surfaces (cells of a height field).
+
+    Returns:
+        (One map; statistics `local_retraced`: texels that got a ray although the mesh had none there, `rem_texels`: texels
+        with a surface, `rem_missing`: those that no reference map sees, `rem_shaded`: those of them that were shaded where
+        they lie).
+    """
+    device, threads, n = scene.device, settings.threads, mesh.inverse.shape[1]
+    local = empty_maps(scene, centre[None], np.eye(3)[None], n)
+    state = wp.empty(FACE_COUNT * n * n, dtype=wp.uint8, device=device)
+    eye = wp.vec3(*(centre - scene.origin))
+    chosen = wp.array(np.asarray(rems, np.int32), dtype=int, device=device)
+
+    def blend(texels: np.ndarray | None) -> wp.array:
+        local.view.triangle = wp.array(mesh.triangle.reshape(-1), dtype=int, device=device)
+        inverse = wp.array(mesh.inverse.reshape(-1), dtype=float, device=device)
+        index = wp.array(np.zeros(0, np.int32) if texels is None else texels, dtype=int, device=device)
+        inputs = [scene.view, scene.lights, maps.view, chosen, settings.rem_count, eye, float(slack), n, index]
+        inputs += [inverse, local.view.triangle, local.view.radiance, local.view.distance, state]
+        launch.launch(blend_kernel, len(state) if texels is None else len(texels), inputs, device, threads)
+        return inverse
+
+    inverse = blend(None)
+    again = np.flatnonzero((state.numpy() == TEXEL_MISSING) & ~mesh.traced.reshape(-1)).astype(np.int32)
+    if len(again):
+        mesh.trace(again, intersect)
+        inverse = blend(again)
+    found = state.numpy()
+    missing = np.flatnonzero(found == TEXEL_MISSING)
+    statistics = {"local_retraced": len(again), "rem_texels": int((found != TEXEL_SKY).sum())}
+    statistics |= {"rem_missing": len(missing), "rem_shaded": 0}
+    if settings.rem_missing == "shade":
+        missing = missing[mesh.triangle.reshape(-1)[missing] >= 0]
+        statistics["rem_shaded"] = len(missing)
+        for face in np.unique(missing // (n * n)):
+            own = missing[missing // (n * n) == face]
+            _shade_texels(scene, local, inverse, own, int(face), settings)
+    return local, statistics
+
+
+def _shade_texels(scene: Scene, local: CubeMaps, inverse: wp.array, texels: np.ndarray, face: int, settings) -> None:
+    device, count, n = scene.device, len(texels), local.resolution
+    texel = wp.array(texels.astype(np.int32), dtype=int, device=device)
+    point, direction = (wp.empty(count, dtype=wp.vec3, device=device) for _ in range(2))
+    u, v = (wp.empty(count, dtype=float, device=device) for _ in range(2))
+    triangle = wp.empty(count, dtype=int, device=device)
+    centre, axes = local.centres[0], local.axes[0]
+    eye = wp.vec3(*(centre - scene.origin))
+    inputs = [scene.view, eye, n, texel, inverse, local.view.triangle, point, direction, triangle, u, v]
+    launch.launch(missing_hits_kernel, count, inputs, device, settings.threads)
+    camera = face_camera(scene, centre, axes, face, n)
+    gbuffer = GBuffer(camera, camera.view(scene), triangle, u)
+    layer = hits_layer(point, direction, triangle, u, v)
+    radiance = shade.seen_radiance(scene, gbuffer, layer, settings.threads, settings.shadows)
+    launch.launch(put_radiance_kernel, count, [texel, radiance, local.view.radiance], device, settings.threads)
