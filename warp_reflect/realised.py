@@ -14,7 +14,7 @@ from warp_reflect.frame import Frame
 from warp_reflect.layers import ReflectionLayer
 from warp_reflect.metrics import PixelClass, compare_frames
 from warp_reflect.settings import Status, Technique
-from warp_reflect.techniques import TECHNIQUES
+from warp_reflect.techniques import MAPS, TECHNIQUES
 
 TILE = 16  # pixels a side; what is shifted by more than a tile counts as not shown
 PIXELS = 8192  # that are traced, about: a 95th percentile of them is good to a per cent
@@ -71,7 +71,7 @@ def realised_error(frame: Frame, pixels: int = PIXELS) -> Realised:
         truth[row.reflector.id] = _traced(frame, row, layer, index)
         if row.technique == "environment":
             shown[row.reflector.id] = _from_the_centre(frame, row, layer)
-        if row.technique == "environment" or row.settings.refine == "off":
+        if row.technique in MAPS or row.settings.refine == "off":
             unrefined.add(row.reflector.id)
     mine = _atlas(frame, shown, of_pixel, tiles, frozenset(unrefined))
     true = _atlas(frame, truth, of_pixel, tiles, frozenset())
