@@ -211,7 +211,9 @@ class Frame:
     @cached_property
     def _reflection(self) -> dict[str, wp.array]:
         drawn = frozenset(
-            row.reflector.id for row in self.plan.rows if row.settings.refine == "off" and row.technique != "raytraced"
+            row.reflector.id
+            for row in self.plan.rows
+            if row.technique in MAPS or (row.settings.refine == "off" and row.technique != "raytraced")
         )
         return reflection_channels(self.scene, self.gbuffer, self.layers, self.plan.settings.threads, drawn)
 

@@ -18,7 +18,7 @@ class Status(IntEnum):
     SKY = 2
     """The reflected ray leaves the scene."""
     HIDDEN = 3
-    """The reflector itself stands between the eye and the point."""
+    """The reflector itself stands between the eye and the point; of maps: none of them sees the point."""
     UNREFLECTED = 4
     """The point lies in neither the reflected nor the hidden region of an open reflector."""
     GRAZING = 5

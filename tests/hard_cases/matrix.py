@@ -1,12 +1,10 @@
 """The matrix of numerical hard cases: each id, what it is, and the tests that prove it.
 
-A test is named by file and function; `test_matrix` holds those that had none. Rows of techniques that are not built
-name no test.
+A test is named by file and function; `test_matrix` holds those that had none.
 """
 
 from __future__ import annotations
 
-MAPS = "layered_environment: several reference maps"
 SOLVE, ROOTS, QUADRICS = "test_solve.py::test_", "test_solve_roots.py::test_", "test_solve_quadrics.py::test_"
 MAP, GRID, RASTER, HERE = (
     "test_reflector_map.py::test_",
@@ -14,7 +12,7 @@ MAP, GRID, RASTER, HERE = (
     "test_raster.py::test_",
     "test_matrix.py::test_",
 )
-FIELD = "test_heightfield.py::test_"
+FIELD, LAYERED = "test_heightfield.py::test_", "test_layered_environment.py::test_"
 TRACED, SCENES, READ, FORWARD = (
     "test_raytraced.py::test_",
     "test_scenes.py::test_",
@@ -143,7 +141,14 @@ MATRIX: dict[str, tuple[str, tuple[str, ...]]] = {
     ),
     "H15": ("cells of 0.5 at 1e7", (FIELD + "cells_are_found_far_from_the_origin",)),
     "H16": ("sinks below a roof within a cell", (FIELD + "ray_that_sinks_below_a_roof_within_a_cell_meets_it_there",)),
-    **{f"E{k:02d}": (MAPS, ()) for k in range(1, 9)},
+    "E01": ("reference maps at one place", (LAYERED + "maps_at_one_place_share_alike",)),
+    "E02": ("point beyond the axis of two maps", (LAYERED + "weights_add_up_to_one_beyond_the_axis",)),
+    "E03": ("seen by no map", (LAYERED + "what_no_map_sees_is_shaded_or_flagged",)),
+    "E04": ("point at the eye of a map", (LAYERED + "point_at_the_eye_of_a_map_is_seen_by_the_other",)),
+    "E05": ("point on a surface at 80 degrees", (LAYERED + "surface_seen_at_an_angle_does_not_hide_itself",)),
+    "E06": ("sky, which has no distance", (LAYERED + "sky_has_no_distance_and_no_weights",)),
+    "E07": ("weights (0, 1e-38)", (LAYERED + "weights_that_vanish_are_one_maps",)),
+    "E08": ("depths of 0, and none", (LAYERED + "edges_against_the_sky_are_refined_at_any_depth",)),
     "E09": (
         "samples of a picture that are no light",
         ("test_images.py::test_bad_samples_are_replaced_and_counted_on_reading",),
@@ -203,4 +208,3 @@ MATRIX: dict[str, tuple[str, tuple[str, ...]]] = {
     "S05": ("denormal sizes", (HERE + "denormal_points_are_answered",)),
 }
 COUNTS = {"RP": 27, "GI": 9, "Q": 19, "H": 16, "E": 9, "P": 10, "R": 11, "S": 5}
-NOT_BUILT = [name for name, (_, tests) in MATRIX.items() if not tests]

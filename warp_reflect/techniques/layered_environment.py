@@ -32,17 +32,21 @@ wp.set_module_options({"enable_backward": False})
 
 CONVERGED = wp.constant(int(Status.CONVERGED))
 SKY = wp.constant(int(Status.SKY))
+HIDDEN = wp.constant(int(Status.HIDDEN))
+MAX_ITERATIONS = wp.constant(int(Status.MAX_ITERATIONS))
+MISSING = wp.constant(local_map.TEXEL_MISSING)
 CANDIDATES_PER_MAP = 2  # maps that are looked at for each that is blended, where more than two are
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """A mirror's local map at `centre` (world, float64 [3]), and what building it met."""
+    """A mirror's local map at `centre` (world, float64 [3]), the state of its texels, and what building it met."""
 
     part: int
     centre: np.ndarray
     references: ReferenceMaps
     local: CubeMaps
+    state: wp.array
     statistics: dict = field(default_factory=dict)
     timings: dict = field(default_factory=dict)
 
@@ -96,11 +100,13 @@ def prepare(scene: Scene, reflector, settings: Settings) -> Prepared:
     )
     traced = perf_counter()
     rems = nearest_maps(references, centre, settings.rem_count)
-    local, statistics = local_map.blend_local_map(scene, centre, mesh, intersect, references.maps, rems, settings)
+    local, state, statistics = local_map.blend_local_map(
+        scene, centre, mesh, intersect, references.maps, rems, settings
+    )
     timings = {"local_rays": 1e3 * (traced - start), "local_blend": 1e3 * (perf_counter() - traced)}
     beyond = _beyond(scene, part, references.placement.centres, references.reach)
     scene.notes += [note for note in beyond if note not in scene.notes]
-    return Prepared(part, centre, references, local, mesh.statistics | statistics, timings)
+    return Prepared(part, centre, references, local, state, mesh.statistics | statistics, timings)
 
 
 def intersect_scene(scene: Scene, part: int, centre: np.ndarray, threads: int) -> local_map.Intersect:
@@ -137,6 +143,7 @@ def look_up_kernel(
     scene: SceneView,
     lights: LightView,
     local: CubeMapsView,
+    state: wp.array(dtype=wp.uint8),
     steps: int,
     point: wp.array(dtype=wp.vec3),
     direction: wp.array(dtype=wp.vec3),
@@ -185,27 +192,35 @@ def look_up_kernel(
             texel = nearest_texel(local, 0, towards)
         elif settled == 0:
             step = steps
+    off = float(0.0)
     if settled == 0:
-        triangle = local.triangle[texel]
-        if local.distance[texel] == 0.0:
-            # What is passed on the way to the sky is where it was looked for last.
-            triangle = -1
-            t = 0.0
+        # What is passed on the way to the sky is where it was looked for last.
+        triangle = wp.where(local.distance[texel] == 0.0, -1, local.triangle[texel])
         out_triangle[i] = triangle
         if triangle >= 0:
             corner = scene.triangles[triangle]
-            hit = intersect_triangle(
-                point[i], ray, scene.points[corner[0]], scene.points[corner[1]], scene.points[corner[2]]
-            )
+            a = scene.points[corner[0]] - point[i]
+            b = scene.points[corner[1]] - point[i]
+            c = scene.points[corner[2]] - point[i]
+            hit = intersect_triangle(wp.vec3(0.0, 0.0, 0.0), ray, a, b, c)
             weights = clamp_weights(hit.u, hit.v)
             if hit.det == 0.0:
                 weights = wp.vec2(1.0 / 3.0, 1.0 / 3.0)
             out_u[i] = weights[0]
             out_v[i] = weights[1]
-        if triangle < 0:
+            shown = (1.0 - weights[0] - weights[1]) * a + weights[0] * b + weights[1] * c
+            t = wp.length(shown)
+            off = wp.length(wp.cross(unit(shown), ray))
+        else:
+            t = 0.0
             towards = wp.where(local.distance[texel] == 0.0, ray, towards)
     out_distance[i] = t
-    out_status[i] = wp.uint8(wp.where(out_triangle[i] >= 0, CONVERGED, SKY))
+    status = int(SKY)
+    if out_triangle[i] >= 0:
+        status = wp.where(off * float(local.resolution) <= 2.0, CONVERGED, MAX_ITERATIONS)
+        if int(state[texel]) == MISSING:
+            status = HIDDEN
+    out_status[i] = wp.uint8(status)
     out_radiance[i] = fetch_radiance(local, lights, 0, unit(towards), 0.0)
     out_settled[i] = wp.uint8(settled)
 
@@ -222,14 +237,23 @@ def reflect(
     """Look every mirror pixel up in the mirror's local map.
 
     Returns:
-        A layer with `radiance` and status CONVERGED or SKY. Statistics: those of the local map (`local_rays`,
-        `local_discontinuities` and `..._traced`, `rem_texels`, `rem_missing`, `rem_shaded`) and `local_settled`: pixels whose
-        ray was found to hit the very triangle that the map holds.
+        A layer with `radiance` and status CONVERGED (what is shown lies within a texel of the reflected ray), MAX_ITERATIONS
+        (it does not), HIDDEN (no reference map sees it, and it was not shaded) or SKY. Statistics: those of the local map
+        (`local_rays`, `local_discontinuities` and `..._traced`, `rem_texels`, `rem_missing`, `rem_shaded`) and
+        `local_settled`: pixels whose ray was found to hit the very triangle that the map holds.
     """
     layer = ReflectionLayer.empty(pixels, Technique.LAYERED_ENVIRONMENT, scene.device)
     layer.radiance = wp.empty(pixels.count, dtype=wp.vec3, device=scene.device)
     settled = wp.zeros(pixels.count, dtype=wp.uint8, device=scene.device)
-    inputs = [scene.view, scene.lights, prepared.local.view, settings.parallax_steps, pixels.point, pixels.direction]
+    inputs = [
+        scene.view,
+        scene.lights,
+        prepared.local.view,
+        prepared.state,
+        settings.parallax_steps,
+        pixels.point,
+        pixels.direction,
+    ]
     inputs += [layer.triangle, layer.u, layer.v, layer.distance, layer.status, layer.radiance, settled]
     launch.launch(look_up_kernel, pixels.count, inputs, scene.device, settings.threads)
     layer.statistics = prepared.statistics | {"local_settled": int(settled.numpy().sum())}

@@ -12,6 +12,7 @@ from it by:
 * the depth test has slack in proportion to a texel's footprint on the surface at I (its distances are float32, the paper's
   8 bits), so that a surface does not fail it against itself;
 * for more than two REMs the weights of Buehler et al., Unstructured Lumigraph Rendering, SIGGRAPH 2001, section 4.2;
+* a REM on the other side of a surface does not see it, however thin the wall;
 * what no REM sees can be shaded where it is met.
 """
 
@@ -40,12 +41,13 @@ from warp_reflect.layers import GBuffer
 from warp_reflect.scene import Scene, SceneView
 from warp_reflect.settings import Settings
 from warp_reflect.shade import LightView, dome_radiance
-from warp_reflect.shapes import clamp_weights, facet_normal, intersect_triangle
+from warp_reflect.shadows import asked_shadows
+from warp_reflect.shapes import clamp_weights, facet_normal, intersect_triangle, unit
 
 wp.set_module_options({"enable_backward": False})
 
 REMS_MAX = 8  # maps that a local map may look at
-_weights = wp.types.vector(length=REMS_MAX, dtype=wp.float32)
+RemWeights = wp.types.vector(length=REMS_MAX, dtype=wp.float32)
 
 # The depth test's slack: texels' footprint on the surface, and rounding (algorithms: 0.3 to 2 % of the visible fail it).
 SLOPE_TEXELS = wp.constant(0.75)
@@ -65,6 +67,7 @@ INVERSE_MAX = 1.0e30  # inverse depth of a point at the centre itself
 TEXEL_SKY = 0
 TEXEL_BLENDED = 1
 TEXEL_MISSING = 2  # no REM sees its point
+TEXEL_SHADED = 3  # nor did one, and it was shaded where it is
 
 # (directions float32 [n, 3]) -> (distance float32 [n], 0 where there is only sky; triangle int32 [n], -1 likewise, or
 # where it is not known)
@@ -243,16 +246,18 @@ def axis_share(p: wp.vec3, a: wp.vec3, b: wp.vec3) -> float:
 
 @wp.func
 def sees_point(maps: CubeMapsView, k: int, p: wp.vec3, normal: wp.vec3, slack: float) -> bool:
-    """Whether map k sees a point of a surface: nothing stands nearer in its direction.
+    """Whether map k sees a point of a surface: it stands on its side, and nothing is nearer in its direction.
 
     Args:
         maps: The maps.
         k: Which.
         p: Scene frame.
-        normal: Of the surface, unit; zero: unknown.
+        normal: Of the surface on the side that is asked for, unit; zero: unknown.
         slack: Length by which p itself may be off its surface.
     """
     ray = p - maps.centre[k]
+    if wp.dot(normal, ray) > 0.0:
+        return False
     distance = wp.length(ray)
     found = texel_distance(maps, k, nearest_texel(maps, k, ray))
     if found == 0.0:
@@ -276,7 +281,7 @@ def penalty(p: wp.vec3, eye: wp.vec3, centre: wp.vec3) -> float:
 
 
 @wp.func
-def normalised(weights: _weights, count: int, valid: _weights, prior: _weights) -> _weights:
+def normalised(weights: RemWeights, count: int, valid: RemWeights, prior: RemWeights) -> RemWeights:
     """Weights of the valid maps that add up to 1; without any, all to the one that weighed most before.
 
     Args:
@@ -302,15 +307,15 @@ def normalised(weights: _weights, count: int, valid: _weights, prior: _weights) 
         k += 1
     if total > LEAST_WEIGHT:
         return weights / total
-    result = _weights()
+    result = RemWeights()
     result[wp.where(best >= 0, best, best_prior)] = 1.0
     return result
 
 
 @wp.func
 def rem_weights(
-    maps: CubeMapsView, rems: wp.array(dtype=int), used: int, eye: wp.vec3, p: wp.vec3, valid: _weights
-) -> _weights:
+    maps: CubeMapsView, rems: wp.array(dtype=int), used: int, eye: wp.vec3, p: wp.vec3, valid: RemWeights
+) -> RemWeights:
     """Weights of the candidate maps at a point; they add up to 1.
 
     Args:
@@ -322,8 +327,8 @@ def rem_weights(
         valid: 1 for each candidate that sees it.
     """
     count = rems.shape[0]
-    prior = _weights()
-    weights = _weights()
+    prior = RemWeights()
+    weights = RemWeights()
     blended = count
     if used == 1 or count == 1:
         blended = 1
@@ -337,7 +342,7 @@ def rem_weights(
         weights[0] = prior[0] * valid[0]
         weights[1] = prior[1] * valid[1]
     else:
-        pen = _weights()
+        pen = RemWeights()
         worst = float(0.0)
         k = int(0)
         while k < count:
@@ -400,17 +405,20 @@ def blend_kernel(
         return
     u = (2.0 * float(column) + 1.0) / float(n) - 1.0
     v = (2.0 * float(row) + 1.0) / float(n) - 1.0
-    local = radiance_direction(face, u, v) / inverse[i]
+    towards = radiance_direction(face, u, v)
+    local = towards / inverse[i]
     p = eye + local
-    distance = wp.length(local)
+    distance = wp.length(towards) / inverse[i]
     out_distance[i] = wp.max(distance, 1.0e-30)
     normal = wp.vec3(0.0, 0.0, 0.0)
     if triangle[i] >= 0:
         corner = scene.triangles[triangle[i]]
         normal = facet_normal(scene.points[corner[0]], scene.points[corner[1]], scene.points[corner[2]])
+        if wp.dot(normal, local) > 0.0:
+            normal = -normal
     count = rems.shape[0]
     asked = wp.where(used <= 2, wp.min(used, count), count)
-    valid = _weights()
+    valid = RemWeights()
     any_valid = int(0)
     k = int(0)
     while k < asked:
@@ -430,7 +438,7 @@ def blend_kernel(
             value = fetch_covered(maps, rems[k], ray, 0.0)
             seen = wp.vec3(value[0], value[1], value[2])
             if value[3] < 0.999:
-                seen += (1.0 - value[3]) * dome_radiance(lights, wp.normalize(ray))
+                seen += (1.0 - value[3]) * dome_radiance(lights, unit(ray))
             total += weights[k] * seen
         k += 1
     out_radiance[i] = wp.vec4(total[0], total[1], total[2], 1.0)
@@ -496,7 +504,7 @@ def blend_local_map(
     rems: np.ndarray,
     settings: Settings,
     slack: float = 0.0,
-) -> tuple[CubeMaps, dict[str, int]]:
+) -> tuple[CubeMaps, wp.array, dict[str, int]]:
     """Colour the texels of a local map from reference maps.
 
     A texel between the nodes of the mesh whose point no map sees gets a ray of its own first: mostly the mesh has missed
@@ -513,9 +521,9 @@ def blend_local_map(
         slack: Length by which the depths may be off the surfaces (cells of a height field).
 
     Returns:
-        (One map; statistics `local_retraced`: texels that got a ray although the mesh had none there, `rem_texels`: texels
-        with a surface, `rem_missing`: those that no reference map sees, `rem_shaded`: those of them that were shaded where
-        they lie).
+        (One map; the state of its texels, uint8 [6 n n], a `TEXEL_...`; statistics `local_retraced`: texels that got a ray
+        although the mesh had none there, `rem_texels`: texels with a surface, `rem_missing`: those that no reference map
+        sees, `rem_shaded`: those of them that were shaded where they lie).
     """
     device, threads, n = scene.device, settings.threads, mesh.inverse.shape[1]
     local = empty_maps(scene, centre[None], np.eye(3)[None], n)
@@ -547,7 +555,9 @@ def blend_local_map(
         for face in np.unique(missing // (n * n)):
             own = missing[missing // (n * n) == face]
             _shade_texels(scene, local, inverse, own, int(face), settings)
-    return local, statistics
+        found[missing] = TEXEL_SHADED
+        state = wp.array(found, dtype=wp.uint8, device=device)
+    return local, state, statistics
 
 
 def _shade_texels(scene: Scene, local: CubeMaps, inverse: wp.array, texels: np.ndarray, face: int, settings) -> None:
@@ -563,5 +573,5 @@ def _shade_texels(scene: Scene, local: CubeMaps, inverse: wp.array, texels: np.n
     camera = face_camera(scene, centre, axes, face, n)
     gbuffer = GBuffer(camera, camera.view(scene), triangle, u)
     layer = hits_layer(point, direction, triangle, u, v)
-    radiance = shade.seen_radiance(scene, gbuffer, layer, settings.threads, settings.shadows)
+    radiance = shade.seen_radiance(scene, gbuffer, layer, settings.threads, asked_shadows(scene, settings))
     launch.launch(put_radiance_kernel, count, [texel, radiance, local.view.radiance], device, settings.threads)

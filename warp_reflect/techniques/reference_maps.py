@@ -16,6 +16,7 @@ from warp_reflect.environment_maps import CubeMaps, pack_maps, render_maps, stor
 from warp_reflect.reflectors import mirror_weight
 from warp_reflect.scene import Note, Scene, same_lights
 from warp_reflect.settings import Settings
+from warp_reflect.shadows import asked_shadows
 from warp_reflect.techniques.environment import centre_of
 
 PATH_TIMES = 9  # times of a stage at which the places of moving mirrors are asked
@@ -194,7 +195,7 @@ def draw_maps(scene: Scene, placement: Placement, settings: Settings) -> CubeMap
         settings.environment_resolution,
         axes=placement.axes,
         without=[left_out(scene, centre, settings) for centre in placement.centres],
-        shadows=settings.shadows,
+        shadows=asked_shadows(scene, settings),
         threads=settings.threads,
     )
 
@@ -342,7 +343,7 @@ def _errors(
 
 def _key(settings: Settings) -> tuple:
     names = ("environment_resolution", "rem_texels", "rem_limit", "rem_error_px", "shadows")
-    names += ("reflector_max_roughness", "reflector_min_weight")
+    names += ("dome_shadows", "shadow_samples", "reflector_max_roughness", "reflector_min_weight")
     return (KEY, *(getattr(settings, name) for name in names))
 
 
