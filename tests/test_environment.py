@@ -15,6 +15,7 @@ from warp_reflect import environment_maps
 from warp_reflect.cubemap import RADIANCE_AXES, texel_directions
 from warp_reflect.layers import Camera, Reflector
 from warp_reflect.scene import CameraData, InstanceData, LightData, MaterialData, Scene, SceneData
+from warp_reflect.shadows import asked_shadows
 from warp_reflect.techniques import environment
 
 EDGE = 8  # texels along a cube edge of the maps of random texels
@@ -199,7 +200,7 @@ def test_maps_hold_what_rays_from_their_eyes_meet(device):
 
 
 def test_maps_are_shaded_as_pictures_are(device):
-    """Each face is the picture of its camera: matt things, the dome and a light, textures off."""
+    """Each face is the picture of its camera: matt things, the dome, a light and its shadows, textures off."""
     base = room(sphere(), placed(0, 0, 0)).data
     lights = [
         LightData("/dome", "dome", (0.5, 0.6, 0.7), np.eye(4)),
@@ -207,7 +208,7 @@ def test_maps_are_shaded_as_pictures_are(device):
     ]
     scene = Scene(dataclasses.replace(base, lights=lights, materials=[MaterialData()] * 2), device)
     n, eye = 24, CENTRE + [0, 1.2, 1.5]
-    maps = environment_maps.render_maps(scene, eye[None], n)
+    maps = environment_maps.render_maps(scene, eye[None], n, shadows=asked_shadows(scene, wr.Settings()))
     for face in (0, 3, 5):
         right, up, forward = RADIANCE_AXES[face]
         camera = Camera(eye, right, up, forward, n / 2, n / 2, n / 2, n / 2, 1e-3, 1e3, (n, n))
