@@ -28,8 +28,8 @@ FLOORS = {
     "baked_environments",
     3: "solve solver solve_device solve_plane solve_convex solve_map solve_general solve_qim solver_gradients mirrors "
     "refraction solve_refraction solver_arrays reflector_maps techniques techniques.* finishes finishes.*",
-    4: "planner effects lighting probe budget choice applicable calibration realised bake frame motion virtual_objects seen "
-    "sweep sweep_report",
+    4: "planner effects lighting probe budget choice applicable calibration calibrate realised bake frame motion virtual_objects "
+    "seen sweep sweep_report",
     5: "cli viewer viewer.* pipeline process progress cluster farm",
 }
 # Where an imported library may appear, inside functions or out.

@@ -34,8 +34,10 @@ class Costs:
     """The same from the last frame's answer."""
     branches: float = 20.0
     """A vertex whose every reflection point on a concave side is searched."""
-    cut: float = 1.6
-    """A virtual vertex added where edges bend, on a frame that cuts anew."""
+    bent: float = 0.6
+    """A vertex whose edges are looked at, whether they bend, on a frame that cuts anew."""
+    cut: float = 1.0
+    """A virtual vertex added where they do."""
     draw: float = 0.35
     """A virtual triangle, the clipping at the hidden boundary included."""
     interpolated: float = 0.05
@@ -62,6 +64,8 @@ class Costs:
     """A pixel of the picture: drawn, its mirror found, shaded."""
     mirror_pixel: float = 0.15
     """A mirror pixel: its point and normal, and the shading of what it shows."""
+    shadow: float = 1.0
+    """A ray towards a light, that only asks whether anything is in the way, the rest of shadowing included."""
     layer: float = 300.0
     """A reflector: what does not depend on counts."""
     sharing: float = 0.85
@@ -217,7 +221,7 @@ def _microseconds(work: Work, technique: str, settings: Settings, costs: Costs) 
     cold, warm = _search(work.vertices, technique, settings, costs)
     every = costs.layer + work.triangles * (1.0 + added) * costs.draw
     every += work.pixels * (costs.candidate if settings.refine == "off" else _refined(settings, ray, costs))
-    cut = work.vertices * added * costs.cut
+    cut = work.vertices * (costs.bent + added * costs.cut) if added else 0.0
     warm = work.passes * (every + warm * (1.0 + added))
     cold = work.passes * (every + cold + cut)
     rest = 0.0

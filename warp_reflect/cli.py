@@ -1,4 +1,4 @@
-"""The `warp-reflect` command: `plan`, `render`, `bake`, `process`, `view`, `sweep`, `compare`.
+"""The `warp-reflect` command: `plan`, `render`, `bake`, `process`, `view`, `sweep`, `calibrate`, `compare`.
 
 Results go to standard output, notes and errors to standard error. Exit 0: done; 1: a job failed part way;
 2: cannot be done, with one line that says why; 130, 143: stopped by SIGINT, SIGTERM.
@@ -502,6 +502,40 @@ def sweep(
     for file in written.files:
         print(file)
     return PART_WAY if measured.failed else DONE
+
+
+@app.command
+def calibrate(*, device: str = "cpu", repeats: int = 3, debug: Annotated[bool, Parameter(negative=())] = False) -> int:
+    """Measure in half a minute what the steps of a frame cost on this machine, and keep it for plans to choose by.
+
+    Kept in the user's cache for this processor, device and version, or in the file that the environment variable
+    WARP_REFLECT_CALIBRATION names (empty: nowhere). Without it, plans go by the costs of a server core of 2026.
+
+    Args:
+        device: cpu or cuda:0.
+        repeats: Frames of each kind that are timed.
+        debug: Show tracebacks.
+    """
+    from warp_reflect import calibration
+
+    if not 1 <= repeats <= 1000:
+        raise ValueError(f"--repeats: got {repeats}, expected 1 to 1000")
+    device = _open_device(device)
+    calibration.check_writable()
+    from warp_reflect.calibrate import measure
+
+    with reporting(None) as report:
+
+        def tell(text: str) -> None:
+            report.busy(text)
+            if report.style != "rich":
+                report.line(text)
+
+        costs = measure(device, repeats, tell)
+    file = calibration.store(costs, device)
+    print(calibration.table(costs))
+    print(f"{file}: kept for {calibration.described(device)}")
+    return DONE
 
 
 @Parameter(name="*")

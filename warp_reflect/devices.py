@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import json
 import os
+import platform
 import re
 import shutil
 import sys
@@ -81,6 +82,16 @@ def _temporary_cache(source: Path | None = None) -> str:
         for module in source.glob("wp_warp_reflect*"):
             shutil.copytree(module, folder / module.name, dirs_exist_ok=True)
     return str(folder)
+
+
+def processor() -> str:
+    """The processor's name."""
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        for line in cpuinfo.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
 
 
 def heal_kernel_cache(cache: Path) -> list[Path]:

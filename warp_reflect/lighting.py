@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from warp_reflect import shade
+from warp_reflect.budget import BUILT_IN, Costs, speedup
 from warp_reflect.direct import AREA_KINDS
 from warp_reflect.effects import Effect
 from warp_reflect.launch import thread_count
@@ -17,8 +18,6 @@ from warp_reflect.shadows import Shadows, first_count, light_shares
 
 REC709_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 PROBE_SAMPLES = 4  # rays to a shape from each point that is tried
-# Microseconds of one CPU thread (a 2026 server core): a ray that only asks whether anything is in the way.
-SHADOW_US = 0.35
 # Of the visible share of a shape in its penumbra, root mean square, times samples^-3/4 (`tools/bench_shadows.py`).
 PENUMBRA_ERROR = 0.4
 
@@ -32,22 +31,23 @@ class LightRow:
     effects: dict[str, Effect] = field(default_factory=dict)
 
 
-def plan_lights(scene: Scene, probe: Probe | None, settings: Settings) -> list[LightRow]:
+def plan_lights(scene: Scene, probe: Probe | None, settings: Settings, costs: Costs = BUILT_IN) -> list[LightRow]:
     """One row per light of the stage, in its order.
 
     Args:
         scene: The scene.
         probe: What is seen; None: nothing is, or nothing has to be tried (see `needs_probe`).
         settings: The knobs.
+        costs: Of the machine.
     """
-    threads = thread_count(scene.device, settings.threads)
+    ray_ms = 1.0e-3 * costs.shadow / speedup(costs, thread_count(scene.device, settings.threads))
     tried = _tried(scene, probe, settings) if needs_probe(scene, settings) and probe is not None else None
     rows, seen = [], {"distant": 0, "area": 0}
     distant = sum(light.kind == "distant" for light in scene.data.lights)
     for light in scene.data.lights:
         pixels = 0 if probe is None else probe.count
         if light.kind == "dome":
-            ms = 1.0e-3 * pixels * settings.shadow_samples * SHADOW_US / threads
+            ms = pixels * settings.shadow_samples * ray_ms
             reason = f"dome_shadows={settings.dome_shadows}"
             reason += f"; {settings.shadow_samples} rays a point" + (f", {ms:.0f} ms predicted" if pixels else "")
             effect = Effect(settings.dome_shadows == "on", reason, {"samples": settings.shadow_samples, "ms": ms})
@@ -55,7 +55,7 @@ def plan_lights(scene: Scene, probe: Probe | None, settings: Settings) -> list[L
             kind = "distant" if light.kind == "distant" else "area"
             index = seen[kind] + (distant if kind == "area" else 0)
             seen[kind] += 1
-            effect = _effect(settings, kind, None if tried is None else tried[index], pixels, threads)
+            effect = _effect(settings, kind, None if tried is None else tried[index], pixels, ray_ms)
         else:
             effect = Effect(False, f"{light.kind} lights are not used")
         rows.append(LightRow(light.path, light.kind, {"shadows": effect}))
@@ -113,7 +113,7 @@ def _tried(scene: Scene, probe: Probe, settings: Settings) -> list[_Tried]:
     return result
 
 
-def _effect(settings: Settings, kind: str, tried: _Tried | None, pixels: int, threads: int) -> Effect:
+def _effect(settings: Settings, kind: str, tried: _Tried | None, pixels: int, ray_ms: float) -> Effect:
     if settings.shadows != "auto":
         return Effect(settings.shadows == "on", f"shadows={settings.shadows}")
     if tried is None:
@@ -125,7 +125,7 @@ def _effect(settings: Settings, kind: str, tried: _Tried | None, pixels: int, th
         least = first_count(samples)
         rays *= least + tried.penumbra * samples
         error = min(PENUMBRA_ERROR * samples**-0.75, 0.5)
-    ms = 1.0e-3 * rays * SHADOW_US / threads
+    ms = rays * ray_ms
     numbers = {
         "share": tried.share,
         "shadowed": tried.shadowed,

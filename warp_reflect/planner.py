@@ -6,7 +6,7 @@ import dataclasses
 import difflib
 from dataclasses import dataclass, field
 
-from warp_reflect import __version__, applicable, choice, raster, transmission, vector
+from warp_reflect import __version__, applicable, calibration, choice, raster, transmission, vector
 from warp_reflect.applicable import PREFERRED
 from warp_reflect.budget import BUILT_IN, Costs, fixed_ms, predict
 from warp_reflect.effects import Effect, finish_effects, pane_effects
@@ -273,12 +273,12 @@ def make_plan(
             does not apply the mirror is traced, with a note.
         earlier: The plan of another time of the stage; what its techniques prepared is taken over where the world is
             the same (`Scene.shares_world`). It decides nothing but what a request for a time has learnt (`Plan.pace`).
-        costs: What the machine's steps cost, see `calibration.known`; None: `budget.BUILT_IN`.
+        costs: What the machine's steps cost; None: what is known of it, `calibration.known`.
 
     Raises:
         ValueError: an unknown method, an impossible size, or no such camera.
     """
-    settings, costs = settings or Settings(), costs or BUILT_IN
+    settings, costs = settings or Settings(), costs or calibration.known(scene.device)
     if method not in METHODS and method not in TECHNIQUES:
         near = difflib.get_close_matches(method, [*METHODS, *TECHNIQUES], n=3, cutoff=0.3)
         raise ValueError(f"unknown method '{method}'; nearest: {', '.join(near or [*METHODS, *TECHNIQUES])}")
@@ -292,7 +292,7 @@ def make_plan(
     ]
     clear = [k for k, part in enumerate(scene.parts) if transmission.is_transparent(scene, part)]
     pixels, tried = _look(scene, view, [k for k, _, _ in found], clear, settings)
-    lights = plan_lights(scene, tried, settings)
+    lights = plan_lights(scene, tried, settings, costs)
     # What techniques draw themselves is shadowed where the picture is.
     cast = shadows_of(lights, settings)
     drawn = settings.replace(shadows=cast is not None and cast.direct)

@@ -25,6 +25,7 @@ import warp as wp
 
 from warp_reflect import __version__
 from warp_reflect.channels import POINTS
+from warp_reflect.devices import processor
 from warp_reflect.frame import Frame, render_frame
 from warp_reflect.images import srgb_from_linear
 from warp_reflect.launch import thread_count
@@ -525,16 +526,6 @@ def machine(device: wp.DeviceLike = "cpu") -> dict:
         "versions": versions,
         "commit": commit(),
     }
-
-
-def processor() -> str:
-    """The processor's name."""
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        for line in cpuinfo.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
 
 
 def commit() -> str:
