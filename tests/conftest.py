@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 from pathlib import Path
 
@@ -9,17 +10,113 @@ import numpy as np
 import pytest
 import warp as wp
 
+import warp_reflect
+from warp_reflect import launch
+
+# What `--warp-debug` runs where no files are named: tests that launch all kernels in seconds; file to names ("": all of it).
+BOUNDS = {
+    "test_environment.py": ("test_coarser_levels_keep_the_mean", "test_maps_hold_what_rays_from_their_eyes_meet"),
+    "test_explosion_map.py": ("test_frames_are_finite_from_near_and_inside",),
+    "test_forward.py": ("test_planar_equals_the_picture_of_a_mirrored_eye",),
+    "test_glossy.py": (
+        "test_plane_shows_the_lobe_over_a_known_sky[filter-0.15",
+        "test_nothing_gives_more_light_than_it_gets[0.3-accumulate",
+    ),
+    "test_grid.py": ("test_answers_that_are_there_already_are_kept",),
+    "test_heightfield.py": ("test_step_limit", "test_ray", "test_vertical", "test_diagonal", "test_smallest"),
+    "test_motion.py": ("test_motion_of_a_still_scene_and_of_a_first_frame_is_zero",),
+    "test_normal_maps.py": ("test_bumps_are_seen_in_a_mirror",),
+    "test_quadric.py": (
+        "test_search_agrees_with_the_papers_curve_search",
+        "test_branches_hold_the_constructed_point",
+        "test_scene_of_gprims_shows_what_the_reference_shows[ellipsoid_row",
+    ),
+    "test_raster.py": ("",),
+    "test_raytraced.py": ("test_refit_follows_moved_points", "test_trace_is_watertight_at_vertices_and_edges[0.0"),
+    "test_refraction.py": ("test_statuses",),
+    "test_reuse.py": ("test_reuse_of_a_still", "test_objects_behind_a_plane"),
+    "test_scene_field.py": ("test_level_roofs_and_grounds_are_exact_in_both",),
+    "test_segments.py": (
+        "test_open_and_hollow_mirrors_show_what_tracing_shows[hollow near",
+        "test_open_map_tells_unreflected_from_hidden",
+    ),
+    "test_shade.py": ("",),
+    "test_solve.py": ("test_point_on_the_surface_is_its_own_reflection", "test_qim_agrees"),
+    "test_solve_gradients.py": ("",),
+    "test_textures.py": ("test_level_follows_the_path_through_a_mirror",),
+    "test_transmission.py": ("test_water", "test_light_is_totally_reflected", "test_panes_behind"),
+    "test_viewer_session.py": ("test_search_path_descends",),
+}
+CHECKED_MIN = 0.9  # share of the package's kernels that a bounds-checked run launches, or it proves little
+LAUNCHED = pytest.StashKey[list]()
+CHECKED = pytest.StashKey[str]()
+
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--device", default="cpu", help="Warp device the tests run on: cpu or cuda:0")
+    parser.addoption(
+        "--all-architectures", action="store_true", help="Compile kernels for every CUDA architecture from 75 to 120"
+    )
+    parser.addoption(
+        "--warp-debug",
+        action="store_true",
+        help="Compile kernels with Warp's checks of array bounds (a bad index ends the process); tell which were not launched",
+    )
 
 
 def pytest_configure(config: pytest.Config) -> None:
     os.environ["WARP_REFLECT_CALIBRATION"] = ""  # plans as on any machine
+    if config.getoption("--warp-debug"):
+        wp.config.mode = "debug"
+        # Kernels of that mode end the process when two threads run one at the same time: slices one after the other.
+        launch.run_parallel = lambda jobs: [job() for job in jobs]
+        recording = launch.recorded()
+        config.stash[LAUNCHED] = recording.__enter__()
+        config.add_cleanup(lambda: recording.__exit__(None, None, None))
     if hasattr(wp.config, "log_level"):
         wp.config.log_level = wp.LOG_WARNING
     else:
         wp.config.quiet = True
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if not config.getoption("--warp-debug") or config.args_source is pytest.Config.ArgsSource.ARGS:
+        return
+    kept = [item for item in items if item.name.startswith(BOUNDS.get(item.path.name, ()))]
+    for file, names in BOUNDS.items():
+        for name in names:
+            if not any(item.path.name == file and item.name.startswith(name) for item in kept):
+                raise pytest.UsageError(f"--warp-debug: no test in {file} begins with '{name}'")
+    config.hook.pytest_deselected(items=[item for item in items if item not in kept])
+    items[:] = kept
+
+
+def _kernels() -> set[str]:
+    """The names of all kernels of the package, as `launch.recorded` gives them."""
+    package = Path(warp_reflect.__file__).parent
+    found = set()
+    for path in sorted(package.rglob("*.py")):
+        if "@wp.kernel" in path.read_text():
+            module = importlib.import_module(".".join(path.relative_to(package.parent).with_suffix("").parts))
+            found |= {f"{each.module.name}.{each.key}" for each in vars(module).values() if isinstance(each, wp.Kernel)}
+    return found
+
+
+def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
+    if LAUNCHED not in session.config.stash or exitstatus != pytest.ExitCode.OK:
+        return
+    every = _kernels()
+    left = sorted(every - {name for name, _ in session.config.stash[LAUNCHED]})
+    session.config.stash[CHECKED] = f"bounds checked: {len(every) - len(left)} of {len(every)} kernels" + "".join(
+        f"\n  not launched: {name}" for name in left
+    )
+    if len(left) > (1.0 - CHECKED_MIN) * len(every):
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+def pytest_terminal_summary(terminalreporter, config: pytest.Config) -> None:
+    if CHECKED in config.stash:
+        terminalreporter.write_line(config.stash[CHECKED])
 
 
 @pytest.fixture(scope="session")

@@ -195,13 +195,21 @@ def test_kernels_are_launched_through_launch(module):
             assert ast.unparse(node.func) not in ("wp.launch", "wp.launch_tiled"), f"{module}, line {node.lineno}"
 
 
+ARCHITECTURES = (75, 80, 86, 89, 90, 100, 120)  # compute capabilities times ten: Turing to Blackwell
+
+
 @pytest.mark.parametrize("module", KERNEL_MODULES)
-def test_kernels_compile_for_cuda_without_a_gpu(module, tmp_path):
-    """To PTX for the oldest and a newer architecture (compute capability 7.5 and 9.0)."""
+def test_kernels_compile_for_cuda_without_a_gpu(module, tmp_path, request):
+    """To PTX for the oldest and the newest architecture; with `--all-architectures` for those between as well."""
     kernels = importlib.import_module(module)
-    made = wp.compile_aot_module(kernels, arch=[75, 90], module_dir=tmp_path, use_ptx=True)
+    every = request.config.getoption("--all-architectures")
+    architectures = ARCHITECTURES if every else (ARCHITECTURES[0], ARCHITECTURES[-1])
+    made = wp.compile_aot_module(kernels, arch=list(architectures), module_dir=tmp_path, use_ptx=True)
     texts = [Path(path).read_text() for path in made if Path(path).suffix == ".ptx"]
-    assert len(texts) == 2
+    targets = {
+        word.rstrip(",") for text in texts for line in text.splitlines() if ".target" in line for word in line.split()
+    }
+    assert {f"sm_{each}" for each in architectures} <= targets
     for name in (node.name for node in ast.walk(ast.parse(FILES[module].read_text())) if is_kernel(node)):
         for text in texts:
             assert name in text

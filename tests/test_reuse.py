@@ -65,6 +65,16 @@ def moved_camera(scene, step, size=(160, 90)):
     return dataclasses.replace(camera, eye=camera.eye + step * camera.right)
 
 
+def test_reuse_begins_after_a_frame_that_was_to_keep_nothing(ball_room):
+    """Its virtual vertices were not stored: all are searched, and the next frame keeps them."""
+    first = render(ball_room, "quadric")
+    second = render(ball_room, "quadric", first, keep_static=False, reuse_px=0.5)
+    third = render(ball_room, "quadric", second, keep_static=False, reuse_px=0.5)
+    assert "reused" not in second.layers[1].statistics
+    assert third.layers[1].statistics["reused"] > 0
+    assert identical(second, first) == 1.0
+
+
 def test_reuse_keeps_vertices_of_a_slow_eye_within_its_tolerance(ball_room):
     first = render(ball_room, "reflector_map", refine="off", reuse_px=0.5)
     camera = moved_camera(ball_room, 1e-3)

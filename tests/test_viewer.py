@@ -229,6 +229,20 @@ def test_slider_sets_what_its_knob_says(window):
     assert window.session.comparison.share(window.session.comparison.identical) == 1.0
 
 
+def test_click_into_the_plan_forces_the_other_way(window):
+    press(window, "p")
+    size, (left, bottom, _, height) = window.pane_size(inspector.TEXT), window._pane_box(inspector.TEXT)
+    for effect, changes in (("refinement", "refine"), ("", "techniques")):
+        for y in range(size[1]):
+            line = panes.plan_line_at(window.session, size, y, window.whole_plan)
+            if line is not None and getattr(line.row, "path", "") == "/mirror" and line.effect == effect:
+                break
+        drag(window, (left + 40, bottom + height - 1 - y))
+        assert changes in window.session.message or window.session.techniques
+    assert window.session.settings.refine == "exact" and window.session.plan.rows[0].forced
+    assert list(window.session.techniques) == [1]
+
+
 def test_typed_setting_is_set_or_refused_on_screen(window):
     press(window, ":", *"edge_px=1", "Return")
     assert window.session.settings.edge_px == 1.0

@@ -17,6 +17,7 @@ import warp_reflect as wr
 from warp_reflect import cli
 from warp_reflect.layers import Camera
 from warp_reflect.scene import Scene, SceneData
+from warp_reflect.techniques import TECHNIQUES
 from warp_reflect.techniques.grid import CellUse
 from warp_reflect.viewer import cameras, export, geometry, gl, panes, tradeoff
 from warp_reflect.viewer import session as sessions
@@ -311,6 +312,62 @@ def test_results_of_a_sweep_are_read_or_refused(tmp_path):
             tradeoff.read_results(tmp_path / "bad.json")
     with pytest.raises(OSError, match=r"none\.json: cannot be read"):
         tradeoff.read_results(tmp_path / "none.json")
+
+
+# The plan.
+
+
+def line_of(session, effect="", mirror="/mirror"):
+    found = [line for line in session.plan.lines() if getattr(line.row, "path", "") == mirror]
+    return next(line for line in found if line.effect == effect)
+
+
+def test_click_on_a_mirror_takes_its_techniques_in_turn(ball_room):
+    session = Session(ball_room, size=SIZE)
+    planned, seen = session.plan.rows[0].technique, []
+    for _ in range(len(TECHNIQUES) + 1):
+        assert session.toggle(line_of(session))
+        row = session.plan.rows[0]
+        assert session.frame.layers[1].method == wr.Technique[row.technique.upper()]
+        if not session.techniques:
+            break
+        assert row.forced and session.techniques == {1: row.technique}
+        assert row.technique in session.message and "forced" in line_of(session).text
+        seen.append(row.technique)
+    # Each that applies once, in the order of the table; then the plan's own again.
+    assert seen == [name for name in TECHNIQUES if name in seen] and {"quadric", "raytraced"} <= set(seen)
+    assert "planar" not in seen and session.plan.rows[0].technique == planned and not session.plan.rows[0].forced
+
+
+@pytest.mark.parametrize(
+    ("effect", "method"), [("refinement", "quadric"), ("grid", "reflector_map"), ("reuse", "quadric")]
+)
+def test_click_on_an_effect_turns_it_and_back(ball_room, effect, method):
+    session = Session(ball_room, size=SIZE, method=method)
+    at_first = line_of(session, effect).row.effects[effect].on
+    for want in (not at_first, at_first):
+        assert session.toggle(line_of(session, effect))
+        assert session.plan.rows[0].effects[effect].on == want and not session.coarse
+    assert session.settings == wr.Settings()
+
+
+def test_click_on_what_no_setting_turns_says_why(ball_room):
+    session = Session(ball_room, size=SIZE, method="raytraced")
+    before = session.frame
+    assert not session.toggle(line_of(session, "refinement"))
+    assert session.message.startswith("refused: no setting turns refinement on: traced rays are exact already")
+    session = Session(ball_room, size=SIZE, method="reference")
+    assert not session.toggle(line_of(session)) and session.message.startswith("refused: technique = reference")
+    assert before.layers[1].method == wr.Technique.RAYTRACED
+
+
+def test_lines_of_the_text_pane_are_those_of_the_plan(ball_room):
+    session, size = Session(ball_room, size=SIZE), (700, 900)
+    found = [panes.plan_line_at(session, size, y, whole_plan=True) for y in range(size[1])]
+    shown = [line for before, line in pairwise([None, *found]) if line is not None and line != before]
+    assert shown == session.plan.lines()
+    assert "\n".join(line.text for line in shown) == str(session.plan)
+    assert panes.plan_line_at(session, size, 8) is None  # the title of the numbers
 
 
 # Pixels.

@@ -1,4 +1,4 @@
-"""Random hard inputs through `solve`: what comes out, and how exact, as a Markdown table.
+"""Random hard inputs through the public calls: what comes out, and how exact, as a Markdown table.
 
     python tools/stability_report.py [--cases 1000000] [--seed 0]
 
@@ -7,21 +7,35 @@ near, on the surface and beside it by 1e-7, on the eye, on the axes, over sixtee
 comes out may be NaN or infinite. What comes out as found is judged by the two equations it must fulfil, in float64 and
 without the package: it lies on the surface, and the normal there halves the angle between eye and point. Both errors
 are given in what the rounding of the reported point explains.
+
+A tenth of the inputs each goes to all roots of quadrics (judged likewise) with their derivatives, to refraction, to rays
+in heightfields and grids of cells, and to whole frames: small pictures of small stages by every technique, from within
+mirrors, beside their surface, from far away, through lenses of any length, with motion from the frame before. Of these the
+values must be finite and every answer have a status.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import sys
 import time
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 import warp as wp
 
 import warp_reflect as wr
+from warp_reflect.channels import CHANNELS
+from warp_reflect.heightfield import make_heightfield, trace_heightfield
+from warp_reflect.occupancy import make_occupancy, trace_occupancy
 from warp_reflect.settings import Status
+from warp_reflect.solver_gradients import solve_gradients
+from warp_reflect.techniques import TECHNIQUES
 
 # Unit-frame surfaces lx x^2 + ly y^2 + lz z^2 + 2 b z + c = 0.
 SURFACES = {
@@ -41,6 +55,28 @@ SURFACES = {
     "saddle": (0.5, -0.7, 0, -0.5, 0),
 }
 OFFSET_MAX = 1.0e4  # sizes
+SHARE = 0.1  # of the cases, of each kind of call beside `solve` for one root
+# What is looked through: index of refraction, and the surface; None: a plane.
+REFRACTED = {
+    "water": (1.33, None),
+    "glass ball": (1.5, "sphere"),
+    "glass ellipsoid": (1.5, "ellipsoid 3:1:1"),
+    "diamond lens": (2.4, "ellipsoid 100:10:1"),
+    "bubble": (0.75, "sphere"),
+}
+SCENES = Path(__file__).resolve().parents[1] / "usd_scenes"
+STAGES = ("sphere_on_checker", "two_spheres", "ellipsoid_row", "open_bowl", "capped_cylinder", "torus", "far_offset")
+FRAME_SIZE = (64, 36)
+FRAME_KNOBS = {
+    "refine": ("exact", "strict", "off"),
+    "search": ("newton", "midpoint"),
+    "occlusion": ("exact", "painter"),
+    "grid_share": (0.0, 0.0, 0.05),
+    "grid_error_px": (0.0, 0.0, 0.5),
+    "reuse_px": (0.0, 0.5),
+    "edge_px": (0.0, 0.25),
+    "shadows": ("auto", "on"),
+}
 EYES, POINTS = 4, 250  # a batch: one mirror in one place
 EMPTY = (Status.HIDDEN, Status.UNREFLECTED, Status.DEGENERATE, Status.INSIDE, Status.BAD_INPUT)
 
@@ -50,7 +86,7 @@ class Family:
     """What became of one kind of mirror.
 
     Attributes:
-        cases: Pairs of eye and point.
+        cases: Pairs of eye and point, rays, or pixels.
         not_finite: Values that came out NaN or infinite.
         untold: Pairs without a status, or with values where the status says there are none.
         surface: Largest distance of a CONVERGED point from the surface, in roundings of its coordinates.
@@ -89,17 +125,42 @@ def main() -> int:
 
 
 def report(cases: int, seed: int = 0) -> list[Family]:
-    """At least `cases` pairs, shared evenly by all families."""
+    """At least `cases` inputs, shared evenly by all families of a kind."""
     rng = np.random.default_rng(seed)
     names = [(name, side) for name in (*SURFACES, "plane", "plane with an extent") for side in ("outer", "inner")]
     names += [("reflector map of an ellipsoid", "outer")]
-    rounds = -(-cases // (len(names) * 2 * EYES * POINTS))
+    batches = [
+        (f"{name}, {side}, {np.dtype(dtype).name}", partial(_one_batch, name=name, side=side, dtype=dtype))
+        for name, side in names
+        for dtype in (np.float32, np.float64)
+    ]
+    rooted = [(name, side) for name, side in names if name in SURFACES]
+    roots = [
+        (f"{name}, {side}, all roots", partial(_one_batch, name=name, side=side, dtype=np.float64, all_roots=True))
+        for name, side in rooted
+    ]
+    refracted = [
+        (f"refraction, {name}, {np.dtype(dtype).name}", partial(_refraction_batch, name=name, dtype=dtype))
+        for name in REFRACTED
+        for dtype in (np.float32, np.float64)
+    ]
+    rays = [(f"rays, {name}", partial(_ray_batch, name=name)) for name in ("heightfield", "grid of cells")]
+    views = Views()
+    frames = [
+        (f"frames, {method}", partial(_frame_batch, views=views, method=method)) for method in (*TECHNIQUES, "auto")
+    ]
     families = []
-    for name, side in names:
-        for dtype in (np.float32, np.float64):
-            family = Family(f"{name}, {side}, {np.dtype(dtype).name}")
-            for _ in range(rounds):
-                _one_batch(family, name, side, dtype, rng)
+    for group, share in (
+        (batches, 1.0 - 4 * SHARE),
+        (roots, SHARE),
+        (refracted, SHARE),
+        (rays, SHARE),
+        (frames, SHARE),
+    ):
+        for name, batch in group:
+            family = Family(name)
+            while family.cases * len(group) < share * cases:
+                batch(family, rng=rng)
             families.append(family)
     return families
 
@@ -107,7 +168,7 @@ def report(cases: int, seed: int = 0) -> list[Family]:
 def table(families: list[Family]) -> str:
     """The families as Markdown."""
     lines = [
-        "| mirror | cases | not finite | worst distance [roundings] | worst angle [roundings] | silent | statuses |",
+        "| family | cases | not finite | worst distance [roundings] | worst angle [roundings] | silent | statuses |",
         "|---|---|---|---|---|---|---|",
     ]
     for each in families:
@@ -118,29 +179,26 @@ def table(families: list[Family]) -> str:
     return "\n".join(lines)
 
 
-def _one_batch(family: Family, name: str, side: str, dtype, rng: np.random.Generator) -> None:
+def _one_batch(family: Family, name: str, side: str, dtype, rng: np.random.Generator, all_roots: bool = False) -> None:
     q = _matrix(name)
     pose = _pose(10.0 ** rng.uniform(-6, 6), _farthest(name, q), rng)
-    eyes, points = _ends(q, side, rng)
-    bad = ~np.isfinite(points).all(axis=1)
-    world = _moved(pose, np.where(bad[:, None], 0.0, points))
-    world[bad] = points[bad]
-    world = world.astype(dtype)
-    eyes = _moved(pose, eyes)
-    if rng.random() < 0.2:
-        eyes[rng.integers(len(eyes))] = rng.choice([np.nan, np.inf, -np.inf, 0.0], 3)
+    eyes, world = _hard_ends(q, side, pose, dtype, rng)
     mirror = _mirror(name, side, pose, q)
-    solution = wr.solve(mirror, eyes, world)
+    solution = wr.solve(mirror, eyes, world, all_roots=all_roots)
     outputs = [np.asarray(a) for a in (solution.point, solution.normal, solution.virtual, solution.residual)]
-    family.cases += solution.status.size
-    family.not_finite += sum(int(np.count_nonzero(~np.isfinite(a))) for a in outputs)
     empty = np.isin(solution.status, EMPTY)
-    family.untold += int((solution.status == Status.NONE).sum()) + sum(int(a[empty].any()) for a in outputs)
-    family.statuses.update(int(s) for s in solution.status.ravel())
-    found = solution.status == Status.CONVERGED
+    _count(family, solution.status, outputs, empty)
+    point, found = outputs[0], solution.status == Status.CONVERGED
+    if all_roots:
+        k = solution.roots.shape[-2]
+        _count_values(family, (solution.roots, solution.root_length))
+        padding = np.arange(k) >= solution.root_count[..., None]
+        family.untold += int((padding != (solution.root_status == Status.NONE)).sum())
+        _count_values(family, vars(solve_gradients(mirror, eyes, world, solution)).values())
+        point, found = solution.roots, solution.root_status == Status.CONVERGED
     if not found.any() or name.startswith("reflector map"):  # a map has the accuracy of its texels
         return
-    rows, columns = np.nonzero(found)
+    rows, columns = np.nonzero(found)[:2]
     by_matrix = isinstance(mirror, wr.QuadricMirror) and not _is_rotational(q)
     distance, law = _errors(
         q,
@@ -148,13 +206,143 @@ def _one_batch(family: Family, name: str, side: str, dtype, rng: np.random.Gener
         1.0 if side == "outer" else -1.0,
         eyes[rows],
         world[columns].astype(np.float64),
-        outputs[0][found],
+        point[found],
         dtype,
         by_matrix,
     )
     family.surface = max(family.surface, float(distance.max()))
     family.law = max(family.law, float(law.max()))
     family.silent += int((law > 100.0).sum())
+
+
+def _count(family: Family, status: np.ndarray, values: Iterable[np.ndarray], empty: np.ndarray) -> None:
+    """Take statuses and values into account; where `empty` the values must be 0."""
+    family.cases += status.size
+    _count_values(family, values)
+    family.untold += int((status == Status.NONE).sum()) + sum(int(a[empty].any()) for a in values)
+    family.statuses.update(int(s) for s in status.ravel())
+
+
+def _count_values(family: Family, values: Iterable[np.ndarray]) -> None:
+    family.not_finite += sum(int(np.count_nonzero(~np.isfinite(a))) for a in values)
+
+
+def _hard_ends(q, side: str, pose: np.ndarray, dtype, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Eyes and points in world space, some of either not finite."""
+    eyes, points = _ends(q, side, rng)
+    bad = ~np.isfinite(points).all(axis=1)
+    world = _moved(pose, np.where(bad[:, None], 0.0, points))
+    world[bad] = points[bad]
+    eyes = _moved(pose, eyes)
+    if rng.random() < 0.2:
+        eyes[rng.integers(len(eyes))] = rng.choice([np.nan, np.inf, -np.inf, 0.0], 3)
+    return eyes, world.astype(dtype)
+
+
+def _refraction_batch(family: Family, name: str, dtype, rng: np.random.Generator) -> None:
+    ior, shape = REFRACTED[name]
+    q = _matrix("plane" if shape is None else shape)
+    pose = _pose(10.0 ** rng.uniform(-6, 6), _farthest(shape or "plane", q), rng)
+    eyes, world = _hard_ends(q, "outer" if rng.random() < 0.7 else "inner", pose, dtype, rng)
+    found = wr.refract(_mirror(shape or "plane", "outer", pose, q), eyes, world, ior)
+    values = [np.asarray(value) for name, value in vars(found).items() if name != "status"]
+    _count(family, found.status, values, np.isin(found.status, EMPTY))
+
+
+def _ray_batch(family: Family, name: str, rng: np.random.Generator) -> None:
+    side = int(rng.choice([1, 2, 7, 64]))
+    cell, corner = 10.0 ** rng.uniform(-4, 4), rng.normal(size=3) * rng.choice([0.0, 1.0, 1.0e7])
+    levels = rng.integers(0, 6, (side, side + 1)) * cell * rng.choice([0.5, 1.0])
+    if name == "heightfield":
+        levels[rng.random(levels.shape) < 0.1] = rng.choice([np.nan, np.inf, -np.inf])
+        field, trace = make_heightfield(levels, cell, corner), trace_heightfield
+    else:
+        shape = (side + 1, side, 5)
+        solid = np.argwhere(rng.random(shape) < rng.choice([0.02, 0.3, 1.0]))
+        field, trace = make_occupancy(solid, None, shape, cell, corner), trace_occupancy
+    # Along axes and diagonals, on borders and corners of columns, at their heights, and anywhere.
+    count = EYES * POINTS
+    origins = rng.uniform(-1.0, side + 2.0, (count, 3)) * cell
+    snapped = rng.random((count, 3)) < 0.5
+    origins[snapped] = np.round(origins[snapped] / cell) * cell
+    directions = rng.normal(size=(count, 3)) * 10.0 ** rng.uniform(-38, 30, (count, 1))
+    directions[rng.random((count, 3)) < 0.3] = rng.choice([0.0, -0.0, 1.0e-30])
+    diagonal = rng.random(count) < 0.2
+    directions[diagonal] = rng.choice([-1.0, 0.0, 1.0], (int(diagonal.sum()), 3))
+    for each in (origins, directions):
+        each[rng.random(count) < 0.02, rng.integers(0, 3)] = rng.choice([np.nan, np.inf, -np.inf])
+    found = trace(field, corner + origins, directions, walk=str(rng.choice(["hierarchy", "cells"])))
+    status = found.status.numpy()
+    _count(family, status, [found.t.numpy(), found.normal.numpy()], np.isin(status, [*EMPTY, Status.SKY]))
+    limit = int((status == Status.STEP_LIMIT).sum())
+    family.untold += limit  # a bound that no ray needs
+
+
+class Views:
+    """Stages, read at first use, and hard views of them."""
+
+    def __init__(self) -> None:
+        self._scenes: dict[str, wr.Scene] = {}
+
+    def draw(self, rng: np.random.Generator) -> tuple[wr.Scene, wr.Camera]:
+        """A stage, and a camera that stands anywhere and looks at or away from a mirror."""
+        name = str(rng.choice(STAGES))
+        if name not in self._scenes:
+            self._scenes[name] = wr.load_stage(str(SCENES / f"{name}.usda"))
+        scene = self._scenes[name]
+        plan = wr.make_plan(scene, size=FRAME_SIZE)
+        part = scene.parts[rng.choice([row.reflector.part for row in plan.rows])]
+        own = scene.host_triangles[part.first_triangle : part.first_triangle + part.triangle_count]
+        corner = scene.host_points[own[rng.integers(len(own)), 0]].astype(np.float64)
+        middle = scene.host_points[np.unique(own)].astype(np.float64).mean(axis=0)
+        size = float(np.linalg.norm(corner - middle)) or 1.0
+        outwards = (corner - middle) / size + 0.3 * rng.normal(size=3)
+        share = rng.choice([0.0, 0.5, 1.0, 1.0 + 1e-7, 1.0 + 1e-3, 1.5, 3.0, 30.0, 1e4, 1e7])
+        eye = middle + share * (corner - middle) if share <= 1.01 else middle + share * size * outwards
+        forward = middle - eye if rng.random() < 0.7 else rng.normal(size=3)
+        forward = (
+            forward / (np.linalg.norm(forward) or 1.0) if np.linalg.norm(forward) > 0.0 else np.array([0.0, 0, -1])
+        )
+        right = np.cross(forward, rng.normal(size=3))
+        right /= np.linalg.norm(right)
+        width, height = FRAME_SIZE
+        focal = width * 10.0 ** rng.uniform(-1.5, 3.0)
+        near = size * 10.0 ** rng.uniform(-6, 0)
+        camera = dataclasses.replace(
+            plan.camera,
+            eye=scene.origin + eye,
+            right=right,
+            up=np.cross(right, forward),
+            forward=forward,
+            fx=focal,
+            fy=focal * rng.choice([1.0, 1.5]),
+            cx=0.5 * width + rng.choice([0.0, 0.3 * width]),
+            cy=0.5 * height,
+            near=near,
+            far=near * 10.0 ** rng.uniform(1, 10),
+            orthographic=bool(rng.random() < 0.15),
+        )
+        return scene, camera
+
+
+def _frame_batch(family: Family, views: Views, method: str, rng: np.random.Generator) -> None:
+    scene, camera = views.draw(rng)
+    settings = {"few_pixels": 0, "map_resolution": 32, "environment_resolution": 16}
+    for name, values in FRAME_KNOBS.items():
+        settings[name] = rng.choice(values).item()
+    if settings["refine"] != "off":
+        settings["occlusion"] = "exact"
+    plan = wr.make_plan(scene, camera, FRAME_SIZE, wr.Settings().replace(**settings), method)
+    previous = wr.render_frame(scene, plan)
+    step = dataclasses.replace(camera, eye=camera.eye + rng.normal(size=3) * 0.01 * camera.near)
+    frame = wr.render_frame(scene, plan, camera=step, previous=previous)
+    status = frame["status"].astype(int)
+    mirror = frame["reflectorId"] > 0
+    family.cases += status.size
+    _count_values(family, [frame[name] for name in CHANNELS])
+    seen = np.isin(frame["reflectorId"], list(frame.layers))
+    family.untold += int((mirror & seen & (status == Status.NONE)).sum() + (~mirror & (status != Status.NONE)).sum())
+    family.statuses.update(int(s) for s in status.ravel())
 
 
 def _matrix(name: str) -> np.ndarray:

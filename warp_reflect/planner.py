@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from warp_reflect import __version__, applicable, calibration, choice, raster, transmission, vector
@@ -65,6 +66,21 @@ class PaneRow:
     pixels: int
     effects: dict[str, Effect]
     settings: Settings
+
+
+@dataclass(frozen=True)
+class PlanLine:
+    """A line of a plan as it is printed.
+
+    Attributes:
+        text: The line.
+        row: What it is about; None: the whole plan.
+        effect: The name of the row's effect that it is about; empty: the row itself.
+    """
+
+    text: str
+    row: PlanRow | PaneRow | LightRow | None = None
+    effect: str = ""
 
 
 @dataclass
@@ -178,43 +194,46 @@ class Plan:
             "notes": [{"path": note.path, "text": note.text} for note in [*self.scene.notes, *self.notes]],
         }
 
-    def __str__(self) -> str:
+    def lines(self) -> list[PlanLine]:
+        """The plan for a reader, line by line."""
         width, height = self.camera.size
-        lines = [f"{self.scene.data.source}  camera {self.camera.path}  {width}x{height}"]
+        found = [PlanLine(f"{self.scene.data.source}  camera {self.camera.path}  {width}x{height}")]
         panes = []
         for pane in self.panes:
-            panes.append(f"pane {_name(pane)}  {pane.interface}  {pane.pixels:,d} pixels")
-            panes += [f"    {'on ' if each.on else 'off'} {name}: {each.reason}" for name, each in pane.effects.items()]
+            panes.append(PlanLine(f"pane {_name(pane)}  {pane.interface}  {pane.pixels:,d} pixels", pane))
+            panes += _effect_lines(pane)
+        lights = []
+        for light in self.lights:
+            lights += [PlanLine(f"    {light.path}: {light.kind} light", light), *_effect_lines(light)]
         if not self.rows:
             none = "no reflector: nothing is simulated beyond the direct picture"
-            lines.append(none.replace("beyond", "in mirrors beyond") if panes else none)
-            return "\n".join([*lines, *panes, *self._light_lines()])
+            found.append(PlanLine(none.replace("beyond", "in mirrors beyond") if panes else none))
+            return [*found, *panes, *lights]
         names = [row.name for row in self.rows]
         column = max(len("mirror"), *map(len, names))
         technique = max(len("technique"), *(len(row.technique) + 7 * row.forced for row in self.rows))
-        lines.append(
-            f"  # {'mirror':{column}}  {'technique':{technique}}  {'pixels':>9}  {'error px':>8}  {'ms':>8}  {'kB':>8}"
-        )
+        head = f"{'mirror':{column}}  {'technique':{technique}}  {'pixels':>9}  {'error px':>8}  {'ms':>8}  {'kB':>8}"
+        found.append(PlanLine("  # " + head))
         for row, name in zip(self.rows, names, strict=True):
             chosen = row.technique + " forced" * row.forced
             numbers = (
                 f"{row.predicted['error_px']:8.2f}  {row.predicted['ms']:8.2f}  {row.predicted['bytes'] / 1e3:8,.0f}"
             )
-            lines.append(f"{row.reflector.id:3d} {name:{column}}  {chosen:{technique}}  {row.pixels:9,d}  {numbers}")
-            lines.append(f"    {row.reason}")
-            lines += [f"    {'on ' if each.on else 'off'} {name}: {each.reason}" for name, each in row.effects.items()]
-        lines += [*panes, *self._light_lines()]
+            text = f"{row.reflector.id:3d} {name:{column}}  {chosen:{technique}}  {row.pixels:9,d}  {numbers}"
+            found += [PlanLine(text, row), PlanLine(f"    {row.reason}", row), *_effect_lines(row)]
         whole = self.predicted
         times = f"{whole['ms']:.3g} ms, {whole['first_ms']:.3g} ms from nothing"
-        lines.append(f"a frame: {times}, {whole['error_px']:.2g} px (predicted)")
-        return "\n".join(lines)
+        return [*found, *panes, *lights, PlanLine(f"a frame: {times}, {whole['error_px']:.2g} px (predicted)")]
 
-    def _light_lines(self) -> list[str]:
-        lines = []
-        for row in self.lights:
-            lines.append(f"    {row.path}: {row.kind} light")
-            lines += [f"    {'on ' if each.on else 'off'} {name}: {each.reason}" for name, each in row.effects.items()]
-        return lines
+    def __str__(self) -> str:
+        return "\n".join(line.text for line in self.lines())
+
+
+def _effect_lines(row: PlanRow | PaneRow | LightRow) -> list[PlanLine]:
+    return [
+        PlanLine(f"    {'on ' if each.on else 'off'} {name}: {each.reason}", row, name)
+        for name, each in row.effects.items()
+    ]
 
 
 def _name(row: PlanRow | PaneRow) -> str:
@@ -349,6 +368,29 @@ def prefer_forward(plan: Plan, earlier: Plan | None = None) -> Plan:
     made = dataclasses.replace(plan, rows=rows, _prepared={})
     _take_over(made, plan)
     _take_over(made, earlier)
+    return made
+
+
+def with_techniques(plan: Plan, techniques: Mapping[int, str]) -> Plan:
+    """The plan with mirrors' techniques chosen by hand.
+
+    Args:
+        plan: What it decided for the other mirrors stands, and so do its notes.
+        techniques: Reflector id to a key of `TECHNIQUES`; one that does not apply is left out, with a note.
+    """
+    scene, rows, notes = plan.scene, [], list(plan.notes)
+    for row in plan.rows:
+        name = techniques.get(row.reflector.id, row.technique)
+        if name != row.technique or row.reflector.id in techniques:
+            applies, reason = applicable.applies(scene, row.reflector, plan.camera, name, row.settings)
+            if applies:
+                ask = (scene, row.reflector, plan.camera, name, row.pixels, row.settings, plan.costs)
+                row = _changed(plan, row, name, row.settings, f"asked for; {reason}", _predicted(*ask), forced=True)
+            else:
+                notes.append(Note(row.path, f"{name} does not apply ({reason})"))
+        rows.append(row)
+    made = dataclasses.replace(plan, rows=rows, notes=notes, _prepared={})
+    _take_over(made, plan)
     return made
 
 
@@ -513,20 +555,25 @@ def _fit(made: Plan, pace: float, keep: Plan | None = None) -> None:
         option = chosen.options.get(row.reflector.id)
         if option is None:
             continue
-        weight = row.effects["reflection"].numbers["weight"]
-        part = scene.parts[row.reflector.part]
         reason = chosen.reasons[row.reflector.id]
-        effects = _effects(scene, part, option.technique, row.pixels, weight, option.settings)
-        made.rows[k] = dataclasses.replace(
-            row,
-            technique=option.technique,
-            reason=reason,
-            settings=option.settings,
-            predicted=option.predicted,
-            effects=effects,
-        )
+        made.rows[k] = _changed(made, row, option.technique, option.settings, reason, option.predicted)
     made.notes += [Note(scene.data.source, text) for text in chosen.notes]
     made.pace = pace
+
+
+def _changed(plan: Plan, row: PlanRow, technique, settings, reason, predicted, forced: bool = False) -> PlanRow:
+    """A mirror's row with another choice, and the effects that follow from it."""
+    weight = row.effects["reflection"].numbers["weight"]
+    part = plan.scene.parts[row.reflector.part]
+    return dataclasses.replace(
+        row,
+        technique=technique,
+        forced=forced or row.forced,
+        reason=reason,
+        settings=settings,
+        predicted=predicted,
+        effects=row.effects | _effects(plan.scene, part, technique, row.pixels, weight, settings),
+    )
 
 
 def _options(made: Plan, row: PlanRow) -> list[choice.Option]:

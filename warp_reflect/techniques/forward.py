@@ -230,7 +230,8 @@ def reflect(
         vertices = empty_vertices(mesh.vertex_count, scene.device, with_position=keeping)
         if history:
             wp.copy(vertices.seed, history.vertices.seed)  # the previous frame keeps its own answer
-        if history and keeping:
+        # A frame that was to keep nothing did not store where its virtual vertices lie.
+        if history and keeping and len(history.vertices.position):
             curvature = greatest_curvature * unit_per_scene
             reused, reused_px = reuse.keep(
                 scene, mesh.points, camera, gbuffer.view, history, curvature, settings, vertices

@@ -16,6 +16,7 @@ import pyvista as pv
 from pyvista import _vtk
 
 from warp_reflect.layers import Camera
+from warp_reflect.planner import PlanLine
 from warp_reflect.scene import Scene
 from warp_reflect.settings import Settings
 from warp_reflect.viewer import cameras, geometry, gl, method, panes
@@ -398,6 +399,10 @@ class Inspector:
                 self._drag = "zoom"
             else:
                 self._drag = "pan" if event.startswith("Middle") or interactor.GetShiftKey() else "orbit"
+        elif pane == TEXT and event.startswith("Left"):
+            line = panes.plan_line_at(self.session, self.pane_size(TEXT), local[1], self.whole_plan)
+            if line is not None:
+                self.toggle(line)
         elif pane == CONTROLS and event.startswith("Left"):
             for knob in self._knobs():
                 inside = 0 <= local[1] - knob.track.y < knob.track.height
@@ -508,6 +513,13 @@ class Inspector:
     def turn_knob(self, name: str, value) -> None:
         """Set a control, the camera or the time; what is refused stays, with the reason on screen."""
         if self.session.turn_knob(name, value):
+            self._rest()
+        else:
+            self.draw(CONTROLS)
+
+    def toggle(self, line: PlanLine) -> None:
+        """Force what a line of the plan says the other way; where nothing can, the reason is on screen."""
+        if self.session.toggle(line):
             self._rest()
         else:
             self.draw(CONTROLS)

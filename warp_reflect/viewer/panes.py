@@ -12,17 +12,19 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from warp_reflect.planner import PlanLine
 from warp_reflect.sweep import REFERENCE
 from warp_reflect.viewer.session import CLASS_COLORS, CONTROLS, ERROR_SHOWN_PX, PixelClass, Session, heat_colors
 from warp_reflect.viewer.tradeoff import Mark, Tradeoff
 
-BACK, RAISED, INK, DIM, ACCENT, WARN = (
+BACK, RAISED, INK, DIM, ACCENT, WARN, ON = (
     (24, 26, 30),
     (48, 52, 60),
     (232, 234, 238),
     (150, 156, 168),
     (255, 176, 58),
     (255, 112, 96),
+    (140, 205, 140),
 )
 TITLE_HEIGHT = 28  # pixels, as all below
 MARGIN = 8
@@ -357,30 +359,59 @@ def text_pane(session: Session, size: tuple[int, int], whole_plan: bool = False)
     """Numbers, the last pick and the plan; or the plan alone."""
     image, draw = _blank(size, "")
     bold, mono = _font("DejaVuSans-Bold", TITLE_SIZE), _font("DejaVuSansMono", MONO_SIZE)
-    columns = max(int((image.width - 2 * MARGIN) / draw.textlength("0", mono)), 20)
-    sections = []
+    for place in _text_places(session, (image.width, image.height), whole_plan):
+        if place.is_title:
+            draw.text((MARGIN, place.y), place.text, INK, bold)
+            continue
+        effect = place.line is not None and place.line.effect
+        on = effect and place.line.row.effects[effect].on
+        draw.text((MARGIN, place.y), place.text, ON if on else DIM, mono)
+    return np.asarray(image)
+
+
+def plan_line_at(session: Session, size: tuple[int, int], y: int, whole_plan: bool = False) -> PlanLine | None:
+    """The line of the plan that the text pane shows at a height, y down."""
+    places = _text_places(session, tuple(max(side, PANE_MIN) for side in size), whole_plan)
+    return next((place.line for place in places if place.y <= y < place.y + LINE_HEIGHT and not place.is_title), None)
+
+
+@dataclass(frozen=True)
+class _TextPlace:
+    """A line of the text pane: `line` is the plan's, where it is one."""
+
+    text: str
+    y: int
+    is_title: bool = False
+    line: PlanLine | None = None
+
+
+def _text_places(session: Session, size: tuple[int, int], whole_plan: bool) -> list[_TextPlace]:
+    """What the text pane says, and where."""
+    width, height = size
+    columns = max(int((width - 2 * MARGIN) / _font("DejaVuSansMono", MONO_SIZE).getlength("0")), 20)
+    sections: list[tuple[str, list[tuple[str, PlanLine | None]]]] = []
     if not whole_plan:
-        sections.append(("time and error", session.numbers()))
         picked = session.picks[-1].lines() if session.picks else ["click into the frame: what is seen there"]
-        sections.append(("picked pixel", picked))
-    sections.append(("plan", str(session.plan).splitlines()))
-    y = 6
+        for title, lines in (("time and error", session.numbers()), ("picked pixel", picked)):
+            sections.append((title, [(line, None) for line in lines]))
+    sections.append(("plan: click a line to force the other way", [(line.text, line) for line in session.plan.lines()]))
+    y, places = 6, []
     for title, lines in sections:
-        if y + TITLE_HEIGHT + LINE_HEIGHT > image.height:
+        if y + TITLE_HEIGHT + LINE_HEIGHT > height:
             break
-        draw.text((MARGIN, y), title, INK, bold)
+        places.append(_TextPlace(title, y, is_title=True))
         y += TITLE_HEIGHT - 6
-        folded = [part for line in lines for part in _folded(line, columns)]
-        room = (image.height - y - 4) // LINE_HEIGHT
+        folded = [(part, line) for text, line in lines for part in _folded(text, columns)]
+        room = (height - y - 4) // LINE_HEIGHT
         if len(folded) > room:
             keep = max(room - 1, 0)
             more = "" if whole_plan else " (p: the plan alone)"
-            folded = [*folded[:keep], f"… {len(folded) - keep} more lines{more}"][:room]
-        for line in folded:
-            draw.text((MARGIN, y), line, DIM, mono)
+            folded = [*folded[:keep], (f"… {len(folded) - keep} more lines{more}", None)][:room]
+        for text, line in folded:
+            places.append(_TextPlace(text, y, line=line))
             y += LINE_HEIGHT
         y += 8
-    return np.asarray(image)
+    return places
 
 
 def _folded(line: str, columns: int) -> list[str]:

@@ -7,17 +7,19 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from time import perf_counter
 
 import numpy as np
 
+from warp_reflect import applicable
 from warp_reflect.frame import Frame, render_frame
 from warp_reflect.images import srgb_from_linear
 from warp_reflect.layers import Camera
 from warp_reflect.metrics import Comparison, PixelClass, compare_frames
-from warp_reflect.planner import METHODS, Plan, find_camera, make_plan
+from warp_reflect.planner import METHODS, Plan, PlanLine, PlanRow, find_camera, make_plan, with_techniques
 from warp_reflect.scene import Scene
 from warp_reflect.settings import Settings, Status, Technique
 from warp_reflect.sweep import REFERENCE, Contender
@@ -203,6 +205,7 @@ class Session:
         picks: Picked pixels, the last one last.
         message: What the user should read, such as why a value was refused.
         tradeoff: Accuracy against time: a sweep's points, and those of the settings tried so far in this view.
+        techniques: Chosen by hand for single mirrors, by reflector id.
         pivot: What the camera turns about, world [3].
         frame_ms: Wall time of the frame.
     """
@@ -216,6 +219,7 @@ class Session:
         method: str = "auto",
     ):
         self.settings, self.method = settings or Settings(), method
+        self.techniques: dict[int, str] = {}
         self.size = size or (640, 480)
         self.scene = scene
         self.plan: Plan | None = None
@@ -388,6 +392,62 @@ class Session:
         self.message = f"{shown}; {away[0]}" if away else shown
         return True
 
+    # The plan.
+
+    def toggle(self, line: PlanLine) -> bool:
+        """Force what a line of the plan says the other way; False with the reason in `message` where nothing can.
+
+        Of a mirror's own lines: its next technique that applies, and after the last one what the plan chooses. Of an
+        effect: the first setting among those its reason names that turns it on or off.
+        """
+        row = line.row
+        if isinstance(row, PlanRow) and not line.effect:
+            return self._next_technique(row)
+        if row is None or not line.effect:
+            return False
+        now = row.effects[line.effect]
+        named = [name for name in Settings.names() if re.search(rf"\b{name}\b", now.reason)]
+        for control in (control for control in CONTROLS if control.name in named):
+            known = dataclasses.fields(Settings)
+            default = next(each.default for each in known if each.name == control.name)
+            for value in dict.fromkeys((default, *control.values)):
+                if self._turns(line, control.name, value):
+                    return self.set(control.name, value)
+        self.message = f"refused: no setting turns {line.effect} {'off' if now.on else 'on'}: {now.reason}"
+        return False
+
+    def _turns(self, line: PlanLine, name: str, value) -> bool:
+        """Whether a setting's value turns the effect of a line."""
+        try:
+            settings = self.settings.replace(**{name: value})
+        except ValueError:  # it contradicts another setting
+            return False
+        plan = self._planned(settings)
+        found = next((each for each in plan.lines() if _same_effect(each, line)), None)
+        return found is not None and found.row.effects[line.effect].on != line.row.effects[line.effect].on
+
+    def _next_technique(self, row: PlanRow) -> bool:
+        if self.method == "reference":
+            self.message = "refused: technique = reference traces every mirror"
+            return False
+        id, before = row.reflector.id, dict(self.techniques)
+        names = list(TECHNIQUES)
+        # After what was chosen by hand the names that follow it; at the end what the plan chooses.
+        following = names[names.index(before[id]) + 1 :] if id in before else names
+        for name in following:
+            applies, _ = applicable.applies(self.scene, row.reflector, self.camera, name, row.settings)
+            if applies:
+                self.techniques[id] = name
+                break
+        else:
+            self.techniques.pop(id, None)
+        self._replan()
+        self.picks = []
+        self.refine()
+        chosen = self.techniques.get(id)
+        self.message = f"{row.name}: {chosen}, by hand" if chosen else f"{row.name}: as the plan chooses"
+        return True
+
     # Pixels.
 
     def pick(self, x: int, y: int) -> Pick:
@@ -451,8 +511,12 @@ class Session:
         return " ".join([self.method, *(f"{name}={value}" for name, value in changed.items())])
 
     def _replan(self) -> None:
-        self.plan = make_plan(self.scene, self.camera, self.size, self.settings, self.method, earlier=self.plan)
+        self.plan = self._planned(self.settings)
         self._stale = True
+
+    def _planned(self, settings: Settings) -> Plan:
+        plan = make_plan(self.scene, self.camera, self.size, settings, self.method, earlier=self.plan)
+        return with_techniques(plan, self.techniques) if self.techniques and self.method != "reference" else plan
 
     def _render(self, plan: Plan, previous: Frame | None) -> None:
         if previous is not None and previous.scene is not self.scene:
@@ -472,6 +536,16 @@ class Session:
         elif self.plan.rows and not any(row.pixels for row in self.plan.rows):
             said.append("no mirror is seen from this camera")
         return "; ".join(said)
+
+
+def _same_effect(a: PlanLine, b: PlanLine) -> bool:
+    """Whether two lines, of two plans of one scene, are about the same effect of the same surface or light."""
+
+    def named(line: PlanLine) -> tuple:
+        where = (getattr(line.row, name, "") for name in ("path", "subset", "instance"))
+        return type(line.row), *where, line.effect
+
+    return bool(a.effect) and named(a) == named(b)
 
 
 def pick_of(frame: Frame, x: int, y: int) -> Pick:
