@@ -9,57 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from panes import GLASS, HALF, SIZE, WATER, eye_rays, floor_error_px, frame, stage, upright
 from rooms import placed, sphere, square
 
 import warp_reflect as wr
-from warp_reflect.scene import CameraData, FinishData, InstanceData, LightData, MaterialData, MeshData, Scene, SceneData
-
-GLASS = MaterialData(transmission=1.0, roughness=0.0, ior=1.5)
-WHITE = MaterialData(base_color=(1.0, 1.0, 1.0), specular_workflow=True, roughness=1.0)
-SIZE = (160, 90)
-HALF = 8.0  # of the coded floor
-
-
-EYE = placed(0.1, 0.6, 4.0)
-
-
-def stage(*things, sky=1.0, floor=True, camera=EYE):
-    """Things (mesh, world_from_object, material) over a floor whose radiance is its place: (x, z) scaled to 0 .. 1."""
-    flat = square(1, HALF)
-    where = 0.5 + 0.5 * flat.points[:, [0, 2]] / HALF
-    flat.colors = np.stack([where[:, 0], where[:, 1], np.full(len(where), 0.5)], axis=1).astype(np.float32)
-    flat.color_index = flat.triangles
-    meshes, instances, materials = [flat], [], [dataclasses.replace(WHITE, uses_vertex_color=True)]
-    if floor:
-        instances.append(InstanceData(0, placed(0, -1, -3), "/floor", (0,)))
-    for k, (mesh, world, material) in enumerate(things, 1):
-        meshes.append(mesh)
-        materials.append(material)
-        instances.append(InstanceData(k, world, f"/thing{k}", (k,)))
-    dome = LightData("/dome", "dome", (sky,) * 3, np.eye(4))
-    eye = CameraData("/camera", camera, near=0.05, focal_length=22.0)
-    return Scene(SceneData("coded floor", meshes, instances, materials, [dome], [eye]))
-
-
-def frame(scene, size=SIZE, **settings):
-    return wr.render_frame(scene, wr.make_plan(scene, size=size, settings=wr.Settings(**settings)))
-
-
-def upright(z, half=1.0):
-    """A pane that faces +Z."""
-    world = np.eye(4)
-    world[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
-    world[2, 3] = z
-    return square(1, half), world
-
-
-def eye_rays(camera):
-    """(origin, unit directions [height, width, 3])."""
-    width, height = camera.size
-    x = (np.arange(width) + 0.5 - camera.cx) / camera.fx
-    y = -(np.arange(height) + 0.5 - camera.cy) / camera.fy
-    d = camera.forward + x[None, :, None] * camera.right + y[:, None, None] * camera.up
-    return camera.eye, d / np.linalg.norm(d, axis=2, keepdims=True)
+from warp_reflect.scene import MaterialData, MeshData
 
 
 def refracted(d, n, ior):
@@ -69,17 +23,6 @@ def refracted(d, n, ior):
 
 def schlick(cosine):
     return 0.04 + 0.96 * (1.0 - cosine) ** 5
-
-
-def floor_error_px(picture, expected, mask):
-    """How far the floor's points shown are from the expected ones, in pixels: by how the expected ones change."""
-    # The floor's blue is 0.5 everywhere: the share of the light that got through.
-    share = 2.0 * np.where(mask, picture[..., 2], 0.5)
-    shown = (picture[..., :2] / share[..., None] - 0.5) * 2.0 * HALF
-    shown[..., 1] -= 3.0
-    step = [np.linalg.norm(np.gradient(expected, axis=k), axis=2) for k in (0, 1)]
-    # An axis along which the floor is stretched out least counts: distances over it are the most pixels.
-    return (np.linalg.norm(shown - expected, axis=2) / np.minimum(*step))[mask]
 
 
 # --- bent rays
@@ -118,8 +61,7 @@ def test_glass_ball_shows_what_rays_through_both_its_surfaces_meet():
 
 
 def test_water_shows_the_floor_where_a_bent_ray_meets_it():
-    water = MaterialData(transmission=1.0, roughness=0.0, ior=1.333, finish=FinishData("/w", interface="solid"))
-    scene = stage((square(1, 20.0), placed(0, 0, -3), water))
+    scene = stage((square(1, 20.0), placed(0, 0, -3), WATER))
     shown = frame(scene)
     eye, d = eye_rays(shown.camera)
     p = eye + (-eye[1] / d[..., 1])[..., None] * d

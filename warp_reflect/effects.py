@@ -1,14 +1,21 @@
-"""Which effects a reflector calls for beyond its sharp picture, each with one reason: a value, its threshold, its setting."""
+"""Which effects a surface calls for beyond its sharp picture, each with one reason: a value, its threshold, its setting."""
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from dataclasses import dataclass, field
 
-from warp_reflect.scene import MaterialData, PartRange, Scene
+from warp_reflect.layers import Camera
+from warp_reflect.scene import FinishData, MaterialData, PartRange, Scene
 from warp_reflect.settings import Settings
+from warp_reflect.techniques import MAPS, planar
 
-# The effects that are finishes, in the order in which they are applied, and the module of `finishes` of each.
-FINISHES = {"roughness": "glossy"}
+# The effects of mirrors that are finishes, in the order in which they are applied, and the module of `finishes` of each.
+FINISHES: dict[str, str] = {"waves": "water", "roughness": "glossy", "fade": "fade"}
+# Those of what is seen through transparent surfaces.
+PANE_FINISHES: dict[str, str] = {"waves": "water", "frost": "frost"}
+UNASKED = FinishData("")
 
 
 @dataclass(frozen=True)
@@ -20,22 +27,55 @@ class Effect:
     numbers: dict = field(default_factory=dict)
 
 
-def finish_effects(scene: Scene, part: PartRange, visible: bool, settings: Settings) -> dict[str, Effect]:
+def finish_of(material: MaterialData, settings: Settings) -> FinishData:
+    """What is asked of a surface: what the stage does, else what the settings do."""
+    asked = material.finish or UNASKED
+    grey, white = (settings.fade_grey,) * 3, (settings.frost_grey,) * 3
+    if asked.fade_distance == 0.0:
+        asked = dataclasses.replace(asked, fade_distance=settings.fade_distance, fade_color=grey)
+    if asked.frost_distance == 0.0:
+        asked = dataclasses.replace(asked, frost_distance=settings.frost_distance, frost_color=white)
+    if asked.frost == 0.0:
+        asked = dataclasses.replace(asked, frost=settings.frost or frost_of(material))
+    return asked
+
+
+def frost_of(material: MaterialData) -> float:
+    """Half-angle in degrees of the cone into which a rough transparent surface scatters what is behind it.
+
+    Source: Walter et al., Microfacet Models for Refraction through Rough Surfaces, EGSR 2007. Half of the GGX distribution's
+    slopes are below alpha = roughness^2; a slope s at one face turns a ray by about (ior - 1) s; half of a disc is within
+    1 / sqrt(2) of its radius. Differs from it by: a cone in place of the distribution's long tail.
+    """
+    if material.transmission == 0.0:
+        return 0.0
+    return min(math.degrees(math.atan(math.sqrt(2.0) * (material.ior - 1.0) * material.roughness**2)), 45.0)
+
+
+def finish_effects(
+    scene: Scene, part: PartRange, visible: bool, settings: Settings, technique: str = ""
+) -> dict[str, Effect]:
     """The finishes of a reflector, one effect for each name of `FINISHES`.
 
     Args:
         scene, part: The reflector's.
         visible: Whether the plan's camera sees it; what is not seen has no finish.
         settings: The reflector's.
+        technique: The reflector's.
     """
     if not visible:
         return {name: Effect(False, "not seen from the camera") for name in FINISHES}
     material = scene.data.materials[part.material]
-    return {"roughness": _roughness(material, settings)}
+    finish = finish_of(material, settings)
+    return {
+        "waves": _waves(scene, part, finish, settings),
+        "roughness": _roughness(material, settings),
+        "fade": _fade(finish, technique),
+    }
 
 
 def pane_effects(
-    scene: Scene, part: PartRange, interface: str, reason: str, pixels: int, settings: Settings
+    scene: Scene, part: PartRange, interface: str, reason: str, pixels: int, settings: Settings, camera: Camera
 ) -> dict[str, Effect]:
     """What is simulated of a transparent surface.
 
@@ -45,15 +85,68 @@ def pane_effects(
         reason: Why it is that.
         pixels: At which the plan's camera sees it.
         settings: The plan's.
+        camera: The plan's.
     """
     material = scene.data.materials[part.material]
+    finish = finish_of(material, settings)
     seen = f"{pixels} pixels" if pixels else "not seen from the camera, but perhaps in mirrors and behind others"
     depth = f"up to {settings.transparency_depth} surfaces behind one another (transparency_depth)"
     numbers = {"opacity": material.opacity, "transmission": material.transmission, "pixels": pixels}
+    waves = _waves(scene, part, finish, settings)
+    if waves.on and interface != "solid":
+        waves = Effect(False, "a thin surface bends nothing, still or wavy", waves.numbers)
     return {
         "transparency": Effect(True, f"opacity {material.opacity:g}, {seen}, {depth}", numbers),
         "refraction": Effect(interface == "solid", reason, {"ior": material.ior}),
+        "waves": waves,
+        "frost": _frost(material, finish, settings, camera),
+        "frost_fade": _frost_fade(finish),
     }
+
+
+def moves_with_time(effects: dict[str, Effect]) -> bool:
+    """Whether any effect shows something else at another time in a world where nothing moves."""
+    return any(effect.on and effect.numbers.get("speed", 0.0) > 0.0 for effect in effects.values())
+
+
+def _fade(finish: FinishData, technique: str) -> Effect:
+    numbers = {"distance": finish.fade_distance, "color": list(finish.fade_color)}
+    if finish.fade_distance == 0.0:
+        return Effect(False, "nothing asks for a fade, fade_distance=0", numbers)
+    if technique in MAPS:
+        return Effect(False, "maps know no distances", numbers)
+    return Effect(True, f"to 1/e over {finish.fade_distance:g}", numbers)
+
+
+def _waves(scene: Scene, part: PartRange, finish: FinishData, settings: Settings) -> Effect:
+    numbers = {"slope": finish.wave_slope, "length": finish.wave_length, "speed": finish.wave_speed}
+    if finish.wave_slope == 0.0:
+        return Effect(False, "nothing asks for waves")
+    if settings.waves == "off":
+        return Effect(False, "waves=off", numbers)
+    flat, why = planar.is_flat(scene, part)
+    if not flat:
+        return Effect(False, f"waves are on flat surfaces only; {why}", numbers)
+    return Effect(True, f"slopes of {finish.wave_slope:g} as authored, waves={settings.waves}", numbers)
+
+
+def _frost(material: MaterialData, finish: FinishData, settings: Settings, camera: Camera) -> Effect:
+    radius = math.tan(math.radians(finish.frost)) * max(camera.fx, camera.fy)
+    asked = f"a cone of {finish.frost:.3g} degrees blurs by up to {radius:.3g} px"
+    numbers = {"angle": finish.frost, "radius_px": radius}
+    if material.transmission == 0.0 and finish.frost > 0.0:
+        return Effect(False, "it is partly not there: through the rest one looks straight", numbers)
+    if radius <= settings.frost_px:
+        return Effect(False, f"{asked}, <= {settings.frost_px:g} (frost_px)", numbers)
+    how = f"{settings.frost_samples} rays a pixel" if settings.frost_samples else "the picture behind it is blurred"
+    return Effect(True, f"{asked}, > {settings.frost_px:g} (frost_px); {how} (frost_samples)", numbers)
+
+
+def _frost_fade(finish: FinishData) -> Effect:
+    numbers = {"distance": finish.frost_distance}
+    if finish.frost_distance == 0.0:
+        return Effect(False, "nothing asks for a fade, frost_distance=0", numbers)
+    return Effect(True, f"to 1/e over {finish.frost_distance:g}", numbers)
 
 
 def _roughness(material: MaterialData, settings: Settings) -> Effect:

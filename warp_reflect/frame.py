@@ -5,15 +5,14 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import os
-from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
 import warp as wp
 
-from warp_reflect import __version__, images, motion, raster, shade, surface, transmission
+from warp_reflect import __version__, images, motion, raster, shade, surface, transmission, waves
 from warp_reflect.channels import CHANNELS, POINTS, component_of, known_names, reflection_channels
-from warp_reflect.effects import FINISHES
+from warp_reflect.effects import FINISHES, PANE_FINISHES, finish_of, moves_with_time
 from warp_reflect.layers import Camera, GBuffer, MirrorPixels, ReflectionLayer, add_statistics
 from warp_reflect.planner import Plan, PlanRow, find_camera, keep_pace
 from warp_reflect.scene import Scene
@@ -238,20 +237,20 @@ def render_frame(scene: Scene, plan: Plan, camera: str | Camera | None = None, p
     settings = plan.settings
     view = plan.camera if camera is None else find_camera(scene, camera, plan.size)
     gbuffer, layers = reflect_scene(scene, plan, view, timer, previous)
-    behind = _behind(scene, plan)
-    kept, finish = _kept(layers, previous), _finish(scene, plan, behind)
-    # What moves with time without moving anything, such as waves, is a finish.
-    same_time = finish is None or (previous and previous.scene.data.time == scene.data.time)
+    kept = _kept(layers, previous)
     same_layers = previous and gbuffer is previous.gbuffer and len(kept) == len(layers)
-    if same_layers and same_time and previous.plan.settings == settings:
+    if same_layers and _same_finish(previous, scene, plan):
         picture, transmitted = previous._picture, previous.transmitted
     else:
+        interfaces = _interfaces(scene, plan)
         with timer("shade"):
-            picture = shade.shade(scene, gbuffer, layers, settings.threads, plan.shadows, finish)
+            shown = _shown(scene, plan, gbuffer, interfaces)
+            finish = _finish(scene, plan)
+            picture = shade.shade(scene, gbuffer, layers, settings.threads, plan.shadows, finish, shown)
         transmitted = {}
-        if behind is not None:
+        if interfaces is not None:
             with timer("transmission"):
-                transmitted = _look_through(scene, plan, gbuffer, picture, behind)
+                transmitted = _look_through(scene, plan, transmission.Through(shown, interfaces, plan.shadows), picture)
     timings = timer.ms
     for id in layers.keys() - kept:
         for step, ms in layers[id].timings.items():
@@ -298,48 +297,70 @@ def reflect_scene(
     return gbuffer, layers
 
 
-# What a layer's rays see, with what is behind the transparent surfaces among it.
-Behind = Callable[[GBuffer, ReflectionLayer, wp.array], wp.array]
-
-
-def _behind(scene: Scene, plan: Plan) -> Behind | None:
-    """How transparent surfaces are looked through; None where there are none."""
+def _interfaces(scene: Scene, plan: Plan) -> transmission.Interfaces | None:
+    """How light goes through the transparent surfaces; None where there are none."""
     if not plan.panes:
         return None
-    interfaces = transmission.interface_views(scene)
+    finishes = {}
+    for pane in plan.panes:
+        finish = finish_of(scene.data.materials[scene.parts[pane.part].material], pane.settings)
+        finishes[pane.part] = finish if pane.effects["frost"].on else dataclasses.replace(finish, frost=0.0)
+    return transmission.make_interfaces(scene, finishes)
 
-    def behind(gbuffer: GBuffer, layer: ReflectionLayer, seen: wp.array) -> wp.array:
-        return transmission.behind(scene, gbuffer, interfaces, layer, seen, plan.settings, plan.shadows)
 
-    return behind
+def _shown(scene: Scene, plan: Plan, gbuffer: GBuffer, interfaces: transmission.Interfaces | None) -> shade.Shown:
+    """What the eye sees, with the waves on it, and how what it sees is looked through."""
+    threads = plan.settings.threads
+    shown = shade.look(scene, gbuffer, threads, plan.shadows)
+    surfaces = [*((row.reflector.part, row) for row in plan.rows), *((pane.part, pane) for pane in plan.panes)]
+    wavy = {part: row.settings for part, row in surfaces if row.effects["waves"].on}
+    if wavy:
+        asked = {k: finish_of(scene.data.materials[scene.parts[k].material], each) for k, each in wavy.items()}
+        normals = waves.wave_normals(scene, gbuffer, shown.normals, asked, threads)
+        shown = dataclasses.replace(shown, normals=normals)
+    if interfaces is None:
+        return shown
+
+    direct = shown.seen
+
+    def seen(layer: ReflectionLayer) -> wp.array:
+        radiance = direct(layer)
+        if layer.radiance is not None:
+            return radiance
+        return transmission.behind(scene, gbuffer, interfaces, layer, radiance, plan.settings, plan.shadows)
+
+    return dataclasses.replace(shown, seen=seen)
 
 
 def _look_through(
-    scene: Scene, plan: Plan, gbuffer: GBuffer, picture: tuple, behind: Behind
+    scene: Scene, plan: Plan, through: transmission.Through, picture: tuple
 ) -> dict[int, transmission.Transmission]:
     """Add to a picture what the eye sees through transparent surfaces; it, by the surfaces' parts."""
-    threads = plan.settings.threads
-    parts = {pane.part for pane in plan.panes}
-    shown = transmission.look_through(scene, gbuffer, transmission.interface_views(scene), parts, plan.settings)
-    for found in shown.values():
-        seen = shade.seen_radiance(scene, gbuffer, found.layer, threads, plan.shadows)
-        transmission.add_to_picture(picture[0], found, behind(gbuffer, found.layer, seen), threads)
-    return shown
+    settings, shown, interfaces = plan.settings, through.shown, through.interfaces
+    pixels = transmission.seen_parts(scene, shown.gbuffer, [pane.part for pane in plan.panes])
+    transmitted = {}
+    for pane in plan.panes:
+        if pane.part not in pixels:
+            continue
+        found = transmission.look_through(scene, shown, interfaces, pixels[pane.part], settings)
+        radiance = transmission.through_radiance(scene, through, found, settings)
+        for name, home in PANE_FINISHES.items():
+            if pane.effects[name].on:
+                module = importlib.import_module(f"warp_reflect.finishes.{home}")
+                radiance = module.apply_through(scene, through, found, radiance, pane)
+        transmission.add_to_picture(picture[0], found, radiance, settings.threads)
+        transmitted[pane.part] = found
+    return transmitted
 
 
-def _finish(scene: Scene, plan: Plan, behind: Behind | None) -> shade.Finish | None:
+def _finish(scene: Scene, plan: Plan) -> shade.Finish | None:
     """What the planned finishes make of what sharp mirrors see; None where every mirror is sharp and plain."""
     planned = {row.reflector.id: [name for name in FINISHES if row.effects[name].on] for row in plan.rows}
-    if not any(planned.values()) and behind is None:
+    if not any(planned.values()):
         return None
     rows = {row.reflector.id: row for row in plan.rows}
 
     def finish(shown: shade.Shown, layer: ReflectionLayer, sharp: wp.array) -> wp.array:
-        if behind is not None:
-            direct = shown.seen
-            shown = dataclasses.replace(shown, seen=lambda layer: behind(shown.gbuffer, layer, direct(layer)))
-            if layer.radiance is None:
-                sharp = behind(shown.gbuffer, layer, sharp)
         radiance, reflector = sharp, layer.pixels.reflector
         for name in planned[reflector]:
             module = importlib.import_module(f"warp_reflect.finishes.{FINISHES[name]}")
@@ -373,6 +394,13 @@ def _is_still(previous: Frame | None, scene: Scene, plan: Plan, view: Camera) ->
         and previous.camera.sees_as(view)
         and _mirrors(previous.plan) == _mirrors(plan)
     )
+
+
+def _same_finish(previous: Frame, scene: Scene, plan: Plan) -> bool:
+    """Whether a picture of the same layers looks the same: waves move with time in a world where nothing else does."""
+    asked, before = ([each.effects for each in (*made.rows, *made.panes)] for made in (plan, previous.plan))
+    same_time = previous.scene.data.time == scene.data.time or not any(moves_with_time(each) for each in asked)
+    return same_time and asked == before and previous.plan.settings == plan.settings
 
 
 def _answered(previous: Frame, plan: Plan) -> dict[int, ReflectionLayer]:

@@ -319,7 +319,7 @@ def make_plan(
         _row(scene, view, drawn, method, number, part_index, part, weight, pixels[part_index], notes, costs, lights)
         for number, (part_index, part, weight) in enumerate(found, 1)
     ]
-    panes = [_pane(scene, settings, k, pixels[k]) for k in clear]
+    panes = [_pane(scene, view, settings, k, pixels[k]) for k in clear]
     bumpy = [scene.data.materials[part.material] for _, part, _ in found]
     for path in dict.fromkeys(material.path for material in bumpy if "normal" in material.textures):
         notes.append(
@@ -465,10 +465,10 @@ def _row(scene, camera, settings, method, number, part_index, part, weight, pixe
     )
 
 
-def _pane(scene, settings, part_index, pixels) -> PaneRow:
+def _pane(scene, camera, settings, part_index, pixels) -> PaneRow:
     part = scene.parts[part_index]
     interface, reason = transmission.interface_of(scene, part_index)
-    effects = pane_effects(scene, part, interface, reason, pixels, settings)
+    effects = pane_effects(scene, part, interface, reason, pixels, settings, camera)
     return PaneRow(part_index, part.prim_path, part.subset, part.instance, interface, pixels, effects, settings)
 
 
@@ -639,7 +639,7 @@ def _effects(scene, part, technique, pixels, weight, settings) -> dict[str, Effe
             visible and searched, "from the previous frame where one is given" if searched else no_search
         ),
         "second_bounce": Effect(False, "a mirror seen in a mirror shows its base and the dome, one level deep"),
-        **finish_effects(scene, part, visible, settings),
+        **finish_effects(scene, part, visible, settings, technique),
     }
 
 

@@ -131,9 +131,11 @@ class FinishData:
 
     path: str  # the prim with the API
     interface: str = "auto"  # or "thin", "solid": how light goes through
-    fade_distance: float = 0.0  # over which what is seen fades to 1 / e, 0: it does not [scene units]
+    fade_distance: float = 0.0  # over which what is seen in it fades to 1 / e, 0: it does not [scene units]
     fade_color: tuple[float, float, float] = (0.0, 0.0, 0.0)  # what it fades to, radiance
-    frost: float = 0.0  # half-angle into which what is seen through is scattered [degrees]
+    frost: float = 0.0  # half-angle of the cone into which what is seen through it is scattered [degrees]
+    frost_distance: float = 0.0  # over which what is seen through it fades to 1 / e, 0: it does not [scene units]
+    frost_color: tuple[float, float, float] = (1.0, 1.0, 1.0)  # what that fades to, radiance
     wave_slope: float = 0.0  # root mean square of the waves' slopes, 0: still
     wave_length: float = 1.0  # of the longest wave [scene units]
     wave_speed: float = 1.0  # of the longest wave [scene units per second]

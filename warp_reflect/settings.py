@@ -68,6 +68,7 @@ ENVIRONMENT_UPDATES = ("static", "frame", "previous")
 FIELDS = ("auto", "heightfield", "occupancy")
 GLOSSY = ("filter", "accumulate", "off")
 KERNELS = ("auto", "plain", "vector")
+WAVES = ("lookup", "traced", "off")
 
 
 @dataclass(frozen=True)
@@ -142,6 +143,25 @@ class Settings:
     """Mirrors seen in mirrors, in mirrors ...: how many reflections are followed; beyond them a mirror shows the dome."""
     transparency_depth: int = 8
     """Transparent surfaces behind one another that are looked through; nothing is seen through the next."""
+    fade_distance: float = 0.0
+    """What mirrors show fades over this distance to 1/e, where the stage asks for no fade; 0: it does not. [scene units]"""
+    fade_grey: float = 0.0
+    """Radiance of what `fade_distance` fades to."""
+    frost: float = 0.0
+    """Half-angle of the cone into which transparent surfaces scatter what is behind, where the stage asks for none; 0: by their
+    roughness. [degrees]"""
+    frost_px: float = 0.5
+    """Frost that blurs even what is infinitely far by less than this is left out. [pixels]"""
+    frost_samples: int = 0
+    """Frosted surfaces: 0 blurs the picture of what is behind them, else so many rays a pixel are averaged, the reference."""
+    frost_distance: float = 0.0
+    """What is seen through transparent surfaces fades over this distance to 1/e, where the stage asks for no fade; 0: it does
+    not. [scene units]"""
+    frost_grey: float = 1.0
+    """Radiance of what `frost_distance` fades to."""
+    waves: str = "lookup"
+    """Waves on flat mirrors: `lookup` distorts the pictures of the still surface, `traced` follows the rays that the waves turn,
+    the reference, `off` leaves the surface still."""
     threads: int = 0
     """CPU threads of a launch; 0: one per core."""
     kernels: str = "auto"
@@ -217,6 +237,16 @@ class Settings:
         _require(1 <= self.mesh_cells <= 4096, "mesh_cells", self.mesh_cells, "1 to 4096")
         _require(0.0 <= self.depth_ratio <= 1.0e6, "depth_ratio", self.depth_ratio, "0 (all texels) or a ratio")
         _require(0 <= self.parallax_steps <= 64, "parallax_steps", self.parallax_steps, "0 to 64")
+        for name in ("fade_distance", "frost_distance"):
+            value = getattr(self, name)
+            _require(0.0 <= value <= 1.0e9, name, value, "0 (off) or a length")
+        for name in ("fade_grey", "frost_grey"):
+            value = getattr(self, name)
+            _require(0.0 <= value <= 1.0e6, name, value, "a radiance from 0 on")
+        _require(0.0 <= self.frost <= 45.0, "frost", self.frost, "0 to 45 degrees")
+        _require(0.0 <= self.frost_px <= 1.0e6, "frost_px", self.frost_px, "0 to 1000000 pixels")
+        _require(0 <= self.frost_samples <= 65536, "frost_samples", self.frost_samples, "0 (blurred) to 65536 rays")
+        _require(self.waves in WAVES, "waves", self.waves, f"one of {', '.join(WAVES)}")
         _require(0 <= self.walk_hops <= 64, "walk_hops", self.walk_hops, "0 to 64")
         _require(self.field_kind in FIELDS, "field_kind", self.field_kind, f"one of {', '.join(FIELDS)}")
         _require(0.0 <= self.field_cell <= 1.0e9, "field_cell", self.field_cell, "0 (automatic) or a length")

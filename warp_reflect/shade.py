@@ -539,6 +539,19 @@ def seen_radiance(
     return radiance
 
 
+def look(scene: Scene, gbuffer: GBuffer, threads: int = 0, shadows: Shadows | None = None) -> Shown:
+    """What the eye sees, with what textures and normal maps say of it.
+
+    Args:
+        scene: On the G-buffer's device.
+        gbuffer: With its `reflector_id` set.
+        threads: CPU threads; 0: one per core.
+        shadows: Which lights cast shadows on what is seen in mirrors; None: none.
+    """
+    looks, normals = prepare_looks(scene, gbuffer, None, threads), prepare_normals(scene, gbuffer, None, threads)
+    return Shown(gbuffer, looks, normals, lambda layer: seen_radiance(scene, gbuffer, layer, threads, shadows))
+
+
 def shade(
     scene: Scene,
     gbuffer: GBuffer,
@@ -546,6 +559,7 @@ def shade(
     threads: int = 0,
     shadows: Shadows | None = None,
     finish: Finish | None = None,
+    shown: Shown | None = None,
 ) -> tuple[wp.array, wp.array]:
     """The picture of a frame.
 
@@ -557,23 +571,22 @@ def shade(
         shadows: Which lights cast shadows, directly seen and in mirrors; None: none.
         finish: Turns what a sharp mirror's pixels see (vec3 [layer.pixels.count]) into what this mirror's do; None: all
             are sharp.
+        shown: What the eye sees, where more is known of it than `look` tells.
 
     Returns:
         (linear RGB radiance and coverage, vec4 [height * width]; the reflectors' mirror term alone, vec3
         [height * width], 0 elsewhere).
     """
+    shown = shown or look(scene, gbuffer, threads, shadows)
     count = gbuffer.camera.size[0] * gbuffer.camera.size[1]
     device = scene.device
-    lights = scene.lights
+    lights, looks, normals = scene.lights, shown.looks, shown.normals
     picture = wp.empty(count, dtype=wp.vec4, device=device)
     mirror = wp.empty(count, dtype=wp.vec3, device=device)
-    looks = prepare_looks(scene, gbuffer, None, threads)
-    normals = prepare_normals(scene, gbuffer, None, threads)
     direct, sky = arriving(scene, gbuffer, None, normals, threads, shadows)
     inputs = [scene.view, gbuffer.view, lights, looks, normals, direct, sky, gbuffer.triangle, gbuffer.reflector_id]
     inputs += [picture, mirror]
     launch.launch(shade_kernel, count, inputs, device, threads)
-    shown = Shown(gbuffer, looks, normals, lambda layer: seen_radiance(scene, gbuffer, layer, threads, shadows))
     for layer in layers.values():
         radiance = shown.seen(layer)
         if finish is not None:

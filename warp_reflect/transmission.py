@@ -9,11 +9,17 @@ reflection, which Schlick's does not know.
 A pane is thin: one looks straight through. A solid body bends the ray by Snell's law on the way in and on the way out.
 What a ray meets behind is shaded as what a mirror shows, and where that is transparent too the ray goes on, up to a number
 of surfaces. What a body reflects inside, other than totally, is lost: it is not followed.
+
+Frosted surfaces scatter a ray into a cone: one ray of it where they are seen in mirrors and behind others, the mean of all
+(`finishes/frost.py`) where the eye sees them. What is behind fades by its distance to a colour. Source of both: Diefenbach
+and Badler, Multi-Pass Pipeline Rendering, I3D 1997, as told in Real-Time Rendering, 3rd edition, section 9.3.1. Differs from
+it by: e^(-distance / length) in place of linear fog, so that two distances in a row fade as their sum does.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,8 +35,8 @@ from warp_reflect.layers import (
     pixel_bounds,
 )
 from warp_reflect.normal_maps import prepare_normals
-from warp_reflect.optics import dielectric_reflectance, refract
-from warp_reflect.scene import SHAPE_NONE, PartRange, Scene, SceneView
+from warp_reflect.optics import PI, dielectric_reflectance, refract, tangent_basis
+from warp_reflect.scene import SHAPE_NONE, FinishData, PartRange, Scene, SceneView
 from warp_reflect.settings import Settings, Technique
 from warp_reflect.shadows import Shadows
 from warp_reflect.shapes import facet_normal, unit
@@ -45,6 +51,7 @@ SOLID = wp.constant(2)
 KINDS = ("opaque", "thin", "solid")
 # Share of the light below which what is behind is not looked for: half a step of an 8 bit picture.
 LEAST_WEIGHT = wp.constant(2.0e-3)
+GOLDEN_ANGLE = wp.constant(2.399963229728653)
 
 
 @wp.struct
@@ -53,6 +60,9 @@ class InterfaceView:
 
     kind: int  # OPAQUE, THIN or SOLID
     ior: float
+    spread: float  # tangent of the half-angle of the cone into which it scatters; 0: it does not
+    fade: float  # 1 / the distance over which what is behind fades to 1 / e; 0: it does not
+    fade_color: wp.vec3
 
 
 @wp.struct
@@ -66,6 +76,21 @@ class Crossing:
     inside: int  # the ray is in the surface's body now
 
 
+@dataclass(frozen=True)
+class Through:
+    """What a finish of transparent surfaces works with.
+
+    Attributes:
+        shown: What the eye sees.
+        interfaces: Of the scene.
+        shadows: Which lights cast shadows; None: none.
+    """
+
+    shown: shade.Shown
+    interfaces: Interfaces
+    shadows: Shadows | None = None
+
+
 @dataclass
 class Transmission:
     """What is seen through one surface.
@@ -73,10 +98,12 @@ class Transmission:
     Attributes:
         layer: Its pixels' rays behind the surface and the first thing that they meet.
         weight: vec3 [n], share of it in the picture.
+        nearness: float [n], mean of 1 / length of the way to what is seen in the end, 0 for the sky; set by `behind`.
     """
 
     layer: ReflectionLayer
     weight: wp.array
+    nearness: wp.array
 
 
 def is_transparent(scene: Scene, part: PartRange) -> bool:
@@ -104,15 +131,60 @@ def interface_of(scene: Scene, part_index: int) -> tuple[str, str]:
     return "thin", f"{shares}, open: a pane"
 
 
-def interface_views(scene: Scene) -> wp.array:
-    """`InterfaceView` of every patch of a scene."""
+@dataclass
+class Interfaces:
+    """The surfaces of a scene as light goes through them.
+
+    Attributes:
+        views: `InterfaceView` of every patch.
+        fades: Whether what is behind any of them fades.
+    """
+
+    views: wp.array
+    fades: bool
+
+
+def make_interfaces(scene: Scene, finishes: Mapping[int, FinishData]) -> Interfaces:
+    """How light goes through the surfaces of a scene.
+
+    Args:
+        scene: The scene.
+        finishes: Transparent part to what is asked of it; one that is not to be frosted has frost 0.
+    """
     views = [InterfaceView() for _ in scene.patch_shapes]
-    for index, part in enumerate(scene.parts):
+    for index, finish in finishes.items():
         kind, _ = interface_of(scene, index)
+        part = scene.parts[index]
         for patch in part.patches:
-            views[patch].kind = KINDS.index(kind)
-            views[patch].ior = scene.data.materials[part.material].ior
-    return wp.array(views, dtype=InterfaceView, device=scene.device)
+            view = views[patch]
+            view.kind = KINDS.index(kind)
+            view.ior = scene.data.materials[part.material].ior
+            view.spread = math.tan(math.radians(finish.frost))
+            view.fade = 1.0 / finish.frost_distance if finish.frost_distance > 0.0 else 0.0
+            view.fade_color = wp.vec3(*finish.frost_color)
+    fades = any(finish.frost_distance > 0.0 for finish in finishes.values())
+    return Interfaces(wp.array(views, dtype=InterfaceView, device=scene.device), fades)
+
+
+@wp.func
+def disc_sample(pixel: int, k: int, count: int) -> wp.vec2:
+    """Point k of `count` that fill the unit disc evenly, turned and shifted by the pixel.
+
+    Source: Vogel, A better way to construct the sunflower head, 1979: the golden angle and the root of the rank.
+    """
+    state = wp.rand_init(pixel, k // wp.max(count, 1))
+    turn = wp.randf(state)
+    shift = wp.randf(state)
+    radius = wp.sqrt((float(k % wp.max(count, 1)) + shift) / float(wp.max(count, 1)))
+    angle = GOLDEN_ANGLE * float(k) + 2.0 * PI * turn
+    return wp.vec2(radius * wp.cos(angle), radius * wp.sin(angle))
+
+
+@wp.func
+def scattered(direction: wp.vec3, spread: float, disc: wp.vec2) -> wp.vec3:
+    """A unit direction of the cone about another one."""
+    first, second = tangent_basis(direction)
+    return unit(direction + spread * (disc[0] * first + disc[1] * second))
 
 
 @wp.func
@@ -125,6 +197,7 @@ def cross_interface(
     incident: wp.vec3,
     shaded: float,
     reflector: bool,
+    disc: wp.vec2,
 ) -> Crossing:
     """Lead a ray through a surface.
 
@@ -137,6 +210,7 @@ def cross_interface(
         incident: Unit, towards the surface.
         shaded: Cosine of the angle of incidence that the surface itself is shaded by: what is let through is what that leaves.
         reflector: Whether its mirror term is a reflector's, see `shade.split_lobes`.
+        disc: Where in the cone that a frosted surface scatters into; 0: its middle.
     """
     crossing = Crossing()
     tri = scene.triangles[triangle]
@@ -165,6 +239,10 @@ def cross_interface(
     crossing.normal = outward
     if wp.dot(outward, crossing.direction) < 0.0:
         crossing.normal = -outward
+    if interface.spread > 0.0:
+        turned = scattered(crossing.direction, interface.spread, disc)
+        if wp.dot(turned, crossing.normal) > 0.0:
+            crossing.direction = turned
     return crossing
 
 
@@ -180,6 +258,10 @@ def cross_seen_kernel(
     depth_key: wp.array(dtype=float),
     reflector_id: wp.array(dtype=int),
     pixel: wp.array(dtype=int),
+    # Which ray of how many of a frosted surface's cone (of 0: its middle); whether normal maps and waves bend rays that enter:
+    sample: int,
+    count: int,
+    wavy: int,
     # Outputs:
     out_facet: wp.array(dtype=int),
     out_point: wp.array(dtype=wp.vec3),
@@ -204,8 +286,16 @@ def cross_seen_kernel(
         look = plain_look(scene, tri, uv[0], uv[1])
     n = shown_normal(normals, p, hit_normal(scene, tri, uv[0], uv[1]))
     shaded = wp.abs(wp.dot(n, unit(eye_ray_direction(camera, x, y))))
+    disc = wp.vec2(0.0, 0.0)
+    if count > 0:
+        disc = disc_sample(p, sample, count)
     interface = interfaces[scene.triangle_patch[tri]]
-    crossing = cross_interface(scene, interface, look, tri, s.normal, s.incident, shaded, reflector_id[p] > 0)
+    bent = s.normal
+    corner = scene.triangles[tri]
+    outward = facet_normal(scene.points[corner[0]], scene.points[corner[1]], scene.points[corner[2]])
+    if wavy != 0 or wp.dot(outward, s.incident) > 0.0:
+        bent = shown_normal(normals, p, s.normal)
+    crossing = cross_interface(scene, interface, look, tri, bent, s.incident, shaded, reflector_id[p] > 0, disc)
     out_facet[i] = tri
     out_point[i] = s.p_scene
     out_normal[i] = crossing.normal
@@ -225,24 +315,41 @@ def cross_hits_kernel(
     triangle: wp.array(dtype=int),
     u: wp.array(dtype=float),
     v: wp.array(dtype=float),
+    distance: wp.array(dtype=float),
+    pixel: wp.array(dtype=int),
     direction: wp.array(dtype=wp.vec3),
+    fading: wp.array(dtype=int),
     weight: wp.array(dtype=wp.vec3),
+    depth: int,
     # Outputs:
-    out_own: wp.array(dtype=float),
+    out_own: wp.array(dtype=wp.vec3),
+    out_faded: wp.array(dtype=wp.vec3),
     out_point: wp.array(dtype=wp.vec3),
     out_normal: wp.array(dtype=wp.vec3),
     out_direction: wp.array(dtype=wp.vec3),
     out_inside: wp.array(dtype=wp.uint8),
     out_weight: wp.array(dtype=wp.vec3),
+    out_fading: wp.array(dtype=int),
 ):
-    """One thread per ray: where it goes on behind what it met; weight 0 where it does not."""
+    """One thread per ray: what of it counts here, and where it goes on behind what it met; weight 0 where it does not."""
     i = first + wp.tid()
     tri = triangle[i]
-    out_own[i] = 1.0
+    left = weight[i]
+    if fading.shape[0] > 0 and fading[i] >= 0:
+        # The patch that the ray came through last.
+        veil = interfaces[fading[i]]
+        share = float(1.0)
+        if veil.fade > 0.0:
+            share = wp.where(tri >= 0, wp.exp(-distance[i] * veil.fade), 0.0)
+        out_faded[i] = (1.0 - share) * wp.cw_mul(left, veil.fade_color)
+        left = share * left
+        out_fading[i] = fading[i]
+    out_own[i] = left
     if tri < 0:
         return
     patch = scene.triangle_patch[tri]
-    if interfaces[patch].kind == OPAQUE:
+    interface = interfaces[patch]
+    if interface.kind == OPAQUE:
         return
     d = direction[i]
     corner = scene.triangles[tri]
@@ -261,29 +368,71 @@ def cross_hits_kernel(
         look = looks[i]
     else:
         look = plain_look(scene, tri, u[i], v[i])
-    crossing = cross_interface(scene, interfaces[patch], look, tri, n, d, shaded, False)
-    out_own[i] = crossing.own
+    disc = wp.vec2(0.0, 0.0)
+    if interface.spread > 0.0:
+        disc = disc_sample(pixel[i], depth, 1)
+    crossing = cross_interface(scene, interface, look, tri, n, d, shaded, False, disc)
+    out_own[i] = crossing.own * left
+    carried = wp.cw_mul(left, crossing.weight)
+    if wp.max(carried) < LEAST_WEIGHT:
+        return
     out_point[i] = p
     out_normal[i] = crossing.normal
     out_direction[i] = crossing.direction
     out_inside[i] = wp.uint8(crossing.inside)
-    carried = wp.cw_mul(weight[i], crossing.weight)
-    if wp.max(carried) >= LEAST_WEIGHT:
-        out_weight[i] = carried
+    out_weight[i] = carried
+    if fading.shape[0] > 0 and interface.fade > 0.0:
+        out_fading[i] = patch
 
 
 @wp.kernel
 def gather_kernel(
     first: int,
     index: wp.array(dtype=int),
-    weight: wp.array(dtype=wp.vec3),
-    own: wp.array(dtype=float),
+    own: wp.array(dtype=wp.vec3),
+    faded: wp.array(dtype=wp.vec3),
     seen: wp.array(dtype=wp.vec3),
+    # Outputs:
     out_total: wp.array(dtype=wp.vec3),
 ):
     """One thread per ray; each adds to the total of its own pixel."""
     i = first + wp.tid()
-    out_total[index[i]] += own[i] * wp.cw_mul(weight[i], seen[i])
+    out_total[index[i]] += faded[i] + wp.cw_mul(own[i], seen[i])
+
+
+@wp.kernel
+def nearness_kernel(
+    first: int,
+    index: wp.array(dtype=int),
+    triangle: wp.array(dtype=int),
+    distance: wp.array(dtype=float),
+    own: wp.array(dtype=wp.vec3),
+    carried: wp.array(dtype=wp.vec3),
+    before: wp.array(dtype=float),
+    # Outputs:
+    out_way: wp.array(dtype=float),
+    out_nearness: wp.array(dtype=wp.vec2),
+):
+    """One thread per ray: how near what it met is, weighted by what is not seen through that."""
+    i = first + wp.tid()
+    way = distance[i]
+    if before.shape[0] > 0:
+        way += before[i]
+    out_way[i] = way
+    share = wp.max(wp.max(own[i]) - wp.max(carried[i]), 0.0)
+    if triangle[i] >= 0 and way > 0.0:
+        out_nearness[index[i]] += wp.vec2(share / way, share)
+    else:
+        out_nearness[index[i]] += wp.vec2(0.0, share)
+
+
+@wp.kernel
+def mean_nearness_kernel(first: int, nearness: wp.array(dtype=wp.vec2), out_nearness: wp.array(dtype=float)):
+    """One thread per pixel."""
+    i = first + wp.tid()
+    out_nearness[i] = 0.0
+    if nearness[i][1] > 0.0:
+        out_nearness[i] = nearness[i][0] / nearness[i][1]
 
 
 @wp.kernel
@@ -300,69 +449,88 @@ def transmitted_term_kernel(
     out_picture[pixel[i]] += wp.vec4(term[0], term[1], term[2], 0.0)
 
 
-def look_through(
-    scene: Scene, gbuffer: GBuffer, interfaces: wp.array, parts: Iterable[int], settings: Settings
-) -> dict[int, Transmission]:
-    """The rays behind the transparent surfaces that the eye sees, and the first thing that each meets.
-
-    Args:
-        scene: On the G-buffer's device.
-        gbuffer: What the eye sees.
-        interfaces: From `interface_views`.
-        parts: The transparent surfaces, indices into `scene.parts`.
-        settings: Threads.
-
-    Returns:
-        By part; nothing of one that is not seen.
-    """
-    device, threads = scene.device, settings.threads
+def seen_parts(scene: Scene, gbuffer: GBuffer, parts: Iterable[int]) -> dict[int, np.ndarray]:
+    """Ascending int32 numbers of the pixels at which the eye sees each of some parts; nothing of one that is not seen."""
     triangle = gbuffer.triangle.numpy()
     shown = np.full(len(triangle), -1)
     part_of_patch = np.full(max(len(scene.patch_shapes), 1), -1)
     for part in parts:
         part_of_patch[list(scene.parts[part].patches)] = part
     shown[triangle >= 0] = part_of_patch[scene.host_triangle_patch[triangle[triangle >= 0]]]
-    looks = prepare_looks(scene, gbuffer, None, threads)
-    normals = prepare_normals(scene, gbuffer, None, threads)
-    found = {}
-    for part in sorted(parts):
-        pixel = np.flatnonzero(shown == part).astype(np.int32)
-        if not len(pixel):
-            continue
-        n = len(pixel)
-        vectors = [wp.empty(n, dtype=wp.vec3, device=device) for _ in range(4)]
-        point, normal, direction, weight = vectors
-        facet, inside = wp.empty(n, dtype=int, device=device), wp.empty(n, dtype=wp.uint8, device=device)
-        box = pixel_bounds(pixel, gbuffer.camera.size[0])
-        pixels = MirrorPixels(0, wp.array(pixel, dtype=int, device=device), point, normal, direction, box)
-        inputs = [scene.view, gbuffer.view, interfaces, looks, normals, gbuffer.triangle, gbuffer.depth_key]
-        inputs += [gbuffer.reflector_id, pixels.pixel]
-        launch.launch(cross_seen_kernel, n, [*inputs, facet, point, normal, direction, inside, weight], device, threads)
-        layer = ReflectionLayer.empty(pixels, Technique.RAYTRACED, device)
-        bvh.trace_transmitted(scene, layer, facet, inside, threads)
-        found[part] = Transmission(layer, weight)
-    return found
+    found = {part: np.flatnonzero(shown == part).astype(np.int32) for part in sorted(parts)}
+    return {part: pixel for part, pixel in found.items() if len(pixel)}
+
+
+def look_through(
+    scene: Scene,
+    shown: shade.Shown,
+    interfaces: Interfaces,
+    pixel: np.ndarray,
+    settings: Settings,
+    sample: tuple[int, int] = (0, 0),
+    wavy: bool = False,
+) -> Transmission:
+    """The rays behind a transparent surface that the eye sees, and the first thing that each meets.
+
+    Args:
+        scene: On the G-buffer's device.
+        shown: What the eye sees.
+        interfaces: From `make_interfaces`.
+        pixel: Of one surface, from `seen_parts`.
+        settings: Threads.
+        sample: (k, n): ray k of n of the cone into which a frosted surface scatters; (0, 0): its middle.
+        wavy: Rays are bent at the normals of `shown`, waves included; otherwise only those that leave a body are.
+    """
+    device, threads, gbuffer = scene.device, settings.threads, shown.gbuffer
+    n = len(pixel)
+    vectors = [wp.empty(n, dtype=wp.vec3, device=device) for _ in range(4)]
+    point, normal, direction, weight = vectors
+    facet, inside = wp.empty(n, dtype=int, device=device), wp.empty(n, dtype=wp.uint8, device=device)
+    box = pixel_bounds(pixel, gbuffer.camera.size[0])
+    pixels = MirrorPixels(0, wp.array(pixel, dtype=int, device=device), point, normal, direction, box)
+    inputs = [scene.view, gbuffer.view, interfaces.views, shown.looks, shown.normals, gbuffer.triangle]
+    inputs += [gbuffer.depth_key, gbuffer.reflector_id, pixels.pixel, *sample, int(wavy)]
+    launch.launch(cross_seen_kernel, n, [*inputs, facet, *vectors[:3], inside, weight], device, threads)
+    layer = ReflectionLayer.empty(pixels, Technique.RAYTRACED, device)
+    bvh.trace_transmitted(scene, layer, facet, inside, threads)
+    return Transmission(layer, weight, wp.zeros(n, dtype=float, device=device))
+
+
+def through_radiance(scene: Scene, through: Through, found: Transmission, settings: Settings) -> wp.array:
+    """What a transparent surface's pixels see through it, vec3 [n], before its weight; sets `found.nearness`."""
+    gbuffer, interfaces = through.shown.gbuffer, through.interfaces
+    seen = shade.seen_radiance(scene, gbuffer, found.layer, settings.threads, through.shadows)
+    patches = None
+    if interfaces.fades:
+        triangle = gbuffer.triangle.numpy()[found.layer.pixels.pixel.numpy()]
+        patches = wp.array(scene.host_triangle_patch[triangle], dtype=int, device=scene.device)
+    asked = [interfaces, found.layer, seen, settings, through.shadows, patches, found.nearness]
+    return behind(scene, gbuffer, *asked)
 
 
 def behind(
     scene: Scene,
     gbuffer: GBuffer,
-    interfaces: wp.array,
+    interfaces: Interfaces,
     layer: ReflectionLayer,
     seen: wp.array,
     settings: Settings,
     shadows: Shadows | None = None,
+    patches: wp.array | None = None,
+    nearness: wp.array | None = None,
 ) -> wp.array:
     """What a layer's rays see, with all that is behind the transparent surfaces among it.
 
     Args:
         scene: On the G-buffer's device.
         gbuffer: What the eye sees.
-        interfaces: From `interface_views`.
+        interfaces: From `make_interfaces`.
         layer: Rays and what they met.
         seen: vec3 [n], radiance of that; not written to.
         settings: `transparency_depth`, threads.
         shadows: Which lights cast shadows; None: none.
+        patches: int32 [n], patch that each ray has come through, which fades what is behind it; None: none.
+        nearness: float [n], gets the mean of 1 / length of the way to what is seen in the end; None: not asked for.
 
     Returns:
         vec3 [n]; `seen` itself where nothing is transparent. The layer's statistics get `onward`: rays followed, and
@@ -372,25 +540,35 @@ def behind(
     count = layer.pixels.count
     index = np.arange(count, dtype=np.int32)
     weight = wp.full(count, wp.vec3(1.0, 1.0, 1.0), dtype=wp.vec3, device=device)
-    total = None
+    fading = wp.full(count if interfaces.fades else 0, -1, dtype=int, device=device)
+    if interfaces.fades and patches is not None:
+        fading = patches
+    way = wp.empty(0, dtype=float, device=device)
+    near = wp.zeros(count, dtype=wp.vec2, device=device) if nearness is not None else None
+    total, first = None, layer
     for depth in range(settings.transparency_depth + 1):
         n = layer.pixels.count
         looks = prepare_looks(scene, gbuffer, layer, threads)
         normals = prepare_normals(scene, gbuffer, layer, threads)
-        own = wp.empty(n, dtype=float, device=device)
-        point, normal, direction, carried = (wp.zeros(n, dtype=wp.vec3, device=device) for _ in range(4))
+        own, faded, point, normal, direction, carried = (wp.zeros(n, dtype=wp.vec3, device=device) for _ in range(6))
         inside = wp.zeros(n, dtype=wp.uint8, device=device)
-        inputs = [scene.view, interfaces, looks, normals, layer.triangle, layer.u, layer.v]
-        inputs += [layer.pixels.direction, weight]
-        outputs = [own, point, normal, direction, inside, carried]
+        still_fading = wp.full(len(fading), -1, dtype=int, device=device)
+        inputs = [scene.view, interfaces.views, looks, normals, layer.triangle, layer.u, layer.v, layer.distance]
+        inputs += [layer.pixels.pixel, layer.pixels.direction, fading, weight, depth]
+        outputs = [own, faded, point, normal, direction, inside, carried, still_fading]
         launch.launch(cross_hits_kernel, n, inputs + outputs, device, threads)
         going = np.flatnonzero(carried.numpy().max(axis=1) > 0.0)
-        if depth == 0:
-            if not len(going):
-                return seen
-            total, first = wp.zeros(count, dtype=wp.vec3, device=device), layer
-        gathered = [wp.array(index, dtype=int, device=device), weight, own, seen, total]
-        launch.launch(gather_kernel, n, gathered, device, threads)
+        numbers = wp.array(index, dtype=int, device=device)
+        if near is not None:
+            before, way = way, wp.empty(n, dtype=float, device=device)
+            met = [numbers, layer.triangle, layer.distance, own, carried, before, way, near]
+            launch.launch(nearness_kernel, n, met, device, threads)
+        if total is None:
+            if not len(going) and not (interfaces.fades and patches is not None):
+                total = seen
+                break
+            total = wp.zeros(count, dtype=wp.vec3, device=device)
+        launch.launch(gather_kernel, n, [numbers, own, faded, seen, total], device, threads)
         if depth == settings.transparency_depth:
             _count(first, depth_limit=len(going))
             break
@@ -399,6 +577,8 @@ def behind(
         _count(first, onward=len(going))
         taken = lambda array: wp.array(array.numpy()[going], dtype=array.dtype, device=device)  # noqa: B023, E731
         index, weight = index[going], taken(carried)
+        fading = taken(still_fading) if len(fading) else fading
+        way = taken(way) if len(way) else way
         pixels = MirrorPixels(
             layer.pixels.reflector,
             taken(layer.pixels.pixel),
@@ -411,6 +591,8 @@ def behind(
         layer = ReflectionLayer.empty(pixels, Technique.RAYTRACED, device)
         bvh.trace_transmitted(scene, layer, facet, inside, threads)
         seen = shade.seen_radiance(scene, gbuffer, layer, threads, shadows)
+    if near is not None:
+        launch.launch(mean_nearness_kernel, count, [near, nearness], device, threads)
     return total
 
 

@@ -17,10 +17,12 @@ INTERFACES = ("auto", "thin", "solid")
 NUMBERS = (
     ("fadeDistance", "fade_distance", 0.0, False, np.inf),
     ("frost", "frost", 0.0, False, 45.0),
+    ("frostDistance", "frost_distance", 0.0, False, np.inf),
     ("waveSlope", "wave_slope", 0.0, False, 0.5),
     ("waveLength", "wave_length", 0.0, True, np.inf),
     ("waveSpeed", "wave_speed", 0.0, False, np.inf),
 )
+COLORS = (("fadeColor", "fade_color"), ("frostColor", "frost_color"))
 
 
 def read_finish(prim, intake: Intake) -> FinishData | None:
@@ -41,12 +43,13 @@ def read_finish(prim, intake: Intake) -> FinishData | None:
         interface = prim.GetAttribute(f"{NAMESPACE}:interface")
         if interface and interface.Get(intake.time) is not None:
             values["interface"] = token(interface, intake.time, INTERFACES)
-        color = prim.GetAttribute(f"{NAMESPACE}:fadeColor")
-        if color and color.Get(intake.time) is not None:
-            got = np.array(color.Get(intake.time))
-            if got.shape != (3,) or got.dtype.kind not in "fiu" or not (np.isfinite(got) & (got >= 0.0)).all():
-                raise BadPrim(f"{NAMESPACE}:fadeColor: got {color.Get(intake.time)}, expected 3 numbers from 0 on")
-            values["fade_color"] = tuple(float(v) for v in got)
+        for name, field in COLORS:
+            color = prim.GetAttribute(f"{NAMESPACE}:{name}")
+            if color and color.Get(intake.time) is not None:
+                got = np.array(color.Get(intake.time))
+                if got.shape != (3,) or got.dtype.kind not in "fiu" or not (np.isfinite(got) & (got >= 0.0)).all():
+                    raise BadPrim(f"{NAMESPACE}:{name}: got {color.Get(intake.time)}, expected 3 numbers from 0 on")
+                values[field] = tuple(float(v) for v in got)
     except BadPrim as fault:
         intake.bad(prim.GetPath(), f"{fault}; {FINISH_API} not used")
         return None

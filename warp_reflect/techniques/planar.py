@@ -95,14 +95,11 @@ def applies(
         shape_px: At most this much may it shift what is shown. [pixels]
     """
     part = scene.parts[reflector.part]
+    flat, reason = is_flat(scene, part)
+    if camera is None or flat:
+        return flat, reason
     plane = _plane(scene, part)
     height, sine = _deviation(scene, part, *plane)
-    if camera is None or (height <= FLATNESS_MAX and sine <= NORMAL_SINE_MAX):
-        flat = f"{height:.1e} of its size off its plane (at most {FLATNESS_MAX:.0e})"
-        bent = f"normals off the plane's by a sine of {sine:.1e} (at most {NORMAL_SINE_MAX:.0e})"
-        if height > FLATNESS_MAX:
-            return False, f"not flat: {flat}"
-        return (False, f"not flat: {bent}") if sine > NORMAL_SINE_MAX else (True, f"flat: {flat}")
     points = scene.host_points[np.unique(_corners(scene, part))].astype(np.float64)
     nearest = float(np.linalg.norm(points - (camera.eye - scene.origin), axis=1).min())
     # A plane moved by h moves its picture by 2 h, a normal turned by an angle turns the ray by twice that.
@@ -111,6 +108,16 @@ def applies(
     if shift > shape_px:
         return False, f"not flat: off its plane by up to {shift:.2g} px (at most shape_px={shape_px:g})"
     return True, f"flat: off its plane by up to {shift:.2g} px (at most shape_px={shape_px:g})"
+
+
+def is_flat(scene: Scene, part: PartRange) -> tuple[bool, str]:
+    """Whether a part is a plane to rounding, and the reason."""
+    height, sine = _deviation(scene, part, *_plane(scene, part))
+    flat = f"{height:.1e} of its size off its plane (at most {FLATNESS_MAX:.0e})"
+    bent = f"normals off the plane's by a sine of {sine:.1e} (at most {NORMAL_SINE_MAX:.0e})"
+    if height > FLATNESS_MAX:
+        return False, f"not flat: {flat}"
+    return (False, f"not flat: {bent}") if sine > NORMAL_SINE_MAX else (True, f"flat: {flat}")
 
 
 def prepare(scene: Scene, reflector: Reflector, settings: Settings) -> Prepared:

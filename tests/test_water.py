@@ -1,0 +1,187 @@
+"""Waves on flat mirrors: normals that move with time, look-ups against rays, shores, and what still frames keep of them."""
+
+from __future__ import annotations
+
+import dataclasses
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from panes import HALF, SIZE, WATER, balls, frame, shown_places, stage, upright, with_finish
+from rooms import CHROME, placed, sphere, square
+
+import warp_reflect as wr
+from warp_reflect import raster, waves
+from warp_reflect.scene import MaterialData, Scene
+
+WAVY = with_finish(WATER, wave_slope=0.05, wave_length=1.0, wave_speed=1.0)
+POOL = square(1, 20.0), placed(0, 0, -3)
+
+
+def at_time(scene, time):
+    return scene.seen_at(dataclasses.replace(scene._source, time=time))
+
+
+def reflected_places(shown, mask):
+    """(x, y) of the coded wall that a mirror shows."""
+    picture = shown["reflection"]
+    share = 2.0 * np.where(mask, picture[..., 2], 0.5)
+    return np.where(mask[..., None], (picture[..., :2] / share[..., None] - 0.5) * 2.0 * HALF, 0.0)
+
+
+def test_the_mirrored_picture_is_looked_up_where_the_turned_rays_lead():
+    """A coded wall behind the water: waves move its picture by many pixels, look-ups are off by few of that."""
+    scene = stage((*POOL, dataclasses.replace(WAVY, transmission=0.0, metallic=1.0, base_color=(1.0,) * 3)), sky=1.0)
+    # The floor of the scene, stood up behind the water.
+    data = scene._source
+    turn = upright(0.0)[1]
+    turn[1, 3], turn[2, 3] = 7.9, -8.0
+    data.instances[0] = dataclasses.replace(data.instances[0], world_from_object=turn)
+    scene = Scene(data)
+    size = (320, 180)
+    still, looked, traced = (frame(scene, size, waves=mode) for mode in ("off", "lookup", "traced"))
+    seen = [each["reflection"][..., 2] > 0.0 for each in (still, looked, traced)]
+    # Away from where the picture changes between the wall and the sky, whose blue is 1.
+    wall = np.logical_and.reduce(
+        [np.abs(2.0 * each["reflection"][..., 2] - 1.0) < 0.02 for each in (still, looked, traced)]
+    )
+    mask = np.logical_and.reduce(seen) & wall & (still["reflectorId"] > 0)
+    # What is looked up beyond the frame is not there.
+    mask[160:], mask[:, :40], mask[:, -40:] = False, False, False
+    assert mask.sum() > 3000
+    places = [reflected_places(each, mask) for each in (still, looked, traced)]
+    # Pixels per unit of the wall where the still mirror shows it.
+    step = np.minimum(*(np.linalg.norm(np.gradient(places[0], axis=k), axis=2) for k in (0, 1)))
+    step = np.median(step[mask & (step > 0.0)])
+    moved = np.linalg.norm(places[2] - places[0], axis=2)[mask] / step
+    off = np.linalg.norm(places[1] - places[2], axis=2)[mask] / step
+    assert moved.mean() > 4.0
+    assert off.mean() < 0.1 * moved.mean()
+    assert np.quantile(off, 0.95) < 1.5
+
+
+def test_the_refracted_picture_is_looked_up_where_the_bent_rays_lead():
+    scene = stage((*POOL, with_finish(WAVY, wave_slope=0.1)))
+    size = (320, 180)
+    still, looked, traced = (frame(scene, size, waves=mode) for mode in ("off", "lookup", "traced"))
+    pictures = [each["RGBA"][..., :3] - each["reflection"] for each in (still, looked, traced)]
+    # The near half of the water shows nothing but the floor.
+    mask = np.zeros(size[::-1], bool)
+    mask[110:160, 40:-40] = True
+    mask &= still["primId"] == 2
+    places = [shown_places(each, mask) for each in pictures]
+    step = np.minimum(*(np.linalg.norm(np.gradient(places[0], axis=k), axis=2) for k in (0, 1)))
+    moved = (np.linalg.norm(places[2] - places[0], axis=2) / np.maximum(step, 1e-3))[mask]
+    off = (np.linalg.norm(places[1] - places[2], axis=2) / np.maximum(step, 1e-3))[mask]
+    assert mask.sum() > 8000 and moved.mean() > 1.0
+    assert off.mean() < 0.05 * moved.mean()
+    assert np.quantile(off, 0.95) < 0.25
+
+
+def test_look_ups_stay_on_the_water_at_a_shore_and_of_what_is_above_it():
+    """A small pool: nothing of the ground around it and nothing in front of its surface is seen in it."""
+    pool = square(1, 0.6), placed(0, 0, 1.5)
+    red = MaterialData(base_color=(1.0, 0.0, 0.0), specular_workflow=True, roughness=1.0)
+    ground = square(1, 30.0), placed(0, -1e-3, 0), red
+    mirror = dataclasses.replace(WAVY, transmission=0.0, metallic=1.0, base_color=(1.0,) * 3)
+    # White above: a mirror of the sky alone, whatever the waves.
+    shown = frame(stage((*pool, with_finish(mirror, wave_slope=0.1)), ground, floor=False))
+    inner = shown["reflectorId"] > 0
+    assert inner.sum() > 500
+    np.testing.assert_allclose(shown["reflection"][inner], 1.0, atol=1e-3)
+
+
+def test_waves_move_with_time_and_nothing_else_does():
+    """A still world at another time is drawn again where waves are on it, with its layers kept, and is not where they rest."""
+    scene = stage((*POOL, WAVY), *balls())
+    first = frame(scene)
+    again = wr.render_frame(scene, first.plan, previous=first)
+    assert again._picture is first._picture
+    later = at_time(scene, 6.0)
+    assert later.shares_world(scene)
+    moved = wr.render_frame(later, first.plan, previous=first)
+    assert moved.layers[1] is first.layers[1] and moved.kept == {1}
+    alone = wr.render_frame(later, wr.make_plan(later, size=SIZE))
+    np.testing.assert_array_equal(moved["RGBA"], alone["RGBA"])
+    water = first["reflectorId"] > 0
+    assert (np.abs(moved["RGBA"] - first["RGBA"])[water].max(axis=1) > 0.01).mean() > 0.3
+    np.testing.assert_array_equal(moved["RGBA"][~water], first["RGBA"][~water])
+    for still in (with_finish(WAVY, wave_speed=0.0), with_finish(WAVY, wave_slope=0.0)):
+        scene = stage((*POOL, still), *balls())
+        first = frame(scene)
+        assert wr.render_frame(at_time(scene, 6.0), first.plan, previous=first)._picture is first._picture
+
+
+def test_other_waves_in_the_same_world_are_not_taken_over():
+    scene = stage((*POOL, WAVY), *balls())
+    first = frame(scene)
+    off = frame(scene, previous=first, waves="off")
+    assert (off["RGBA"] != first["RGBA"]).any()
+    np.testing.assert_array_equal(off["RGBA"], frame(scene, waves="off")["RGBA"])
+
+
+def test_normals_have_the_slope_asked_for_and_do_not_care_where_the_stage_is():
+    slopes = []
+    for offset in (0.0, 1.0e6):
+        shift = np.eye(4)
+        shift[:3, 3] = offset
+        camera = np.eye(4)
+        camera[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]  # looks down
+        camera[:3, 3] = 0.0, 3.0, -3.0
+        scene = stage((POOL[0], shift @ POOL[1], WAVY), floor=False, camera=shift @ camera)
+        view = wr.make_plan(scene, size=(160, 90)).camera
+        gbuffer = raster.draw_scene(scene, view)
+        none = waves.wp.zeros(0, dtype=waves.wp.vec3, device=scene.device)
+        finish = {0: scene.data.materials[scene.parts[0].material].finish}
+        n = waves.wave_normals(scene, gbuffer, none, finish).numpy().astype(float)
+        slopes.append((n[:, [0, 2]] / n[:, 1:2]).reshape(90, 160, 2))
+    rms = [np.sqrt((each**2).sum(axis=2).mean()) for each in slopes]
+    np.testing.assert_allclose(rms, 0.05, rtol=0.15)
+    # From pixel to pixel: rounding of the place would show as noise.
+    steps = [np.sqrt((np.diff(each, axis=1) ** 2).sum(axis=2).mean()) for each in slopes]
+    assert steps[1] == pytest.approx(steps[0], rel=0.15) and steps[0] < 0.5 * rms[0]
+
+
+@pytest.mark.parametrize("waves", ["lookup", "traced"])
+@pytest.mark.parametrize("transmission", [0.0, 0.5, 1.0])
+def test_white_furnace_stays_white_on_waves(waves, transmission):
+    water = dataclasses.replace(with_finish(WAVY, wave_slope=0.3), transmission=transmission, base_color=(1.0,) * 3)
+    rgb = frame(stage((*POOL, water), floor=False), waves=waves)["RGBA"][..., :3]
+    assert rgb.max() <= 1.0 + 1e-3
+    np.testing.assert_allclose(rgb, 1.0, atol=2e-3)
+
+
+def test_waves_are_finite_whatever_the_eye():
+    """From below, straight along the surface, orthographic, and with slopes that turn rays into the water."""
+    steep = with_finish(WAVY, wave_slope=0.5, wave_length=0.05)
+    low, below = placed(0.1, 1e-4, 4.0), placed(0.1, -0.5, 2.0)
+    for camera, projection in ((low, "perspective"), (below, "perspective"), (placed(0, 0.5, 2), "orthographic")):
+        for mode in ("lookup", "traced"):
+            shown = frame(stage((*POOL, steep), *balls(), camera=camera, projection=projection), (96, 54), waves=mode)
+            assert np.isfinite(shown["RGBA"]).all() and (shown["RGBA"] >= 0.0).all()
+
+
+def test_curved_mirrors_have_no_waves_and_say_so():
+    scene = stage((sphere(), placed(0, 0, 0, 0.8), with_finish(CHROME, wave_slope=0.1)))
+    effect = wr.make_plan(scene, size=SIZE).rows[0].effects["waves"]
+    assert not effect.on and "not flat" in effect.reason
+
+
+STILL_FRAME = """
+import sys, warp as wp
+wp.config.log_level = wp.LOG_WARNING
+from panes import WATER, frame, stage
+from rooms import placed, square
+shown = frame(stage((square(1, 20.0), placed(0, 0, -3), WATER)))
+assert (shown["reflectorId"] > 0).sum() > 500
+module = wp._src.context.user_modules["warp_reflect.waves"]
+print(bool(module.execs), [name for name in sys.modules if name.startswith("warp_reflect.finishes")])
+"""
+
+
+def test_nothing_of_waves_is_compiled_for_still_water():
+    run = [sys.executable, "-c", STILL_FRAME]
+    done = subprocess.run(run, cwd=Path(__file__).parent, capture_output=True, text=True, check=True)
+    assert done.stdout.strip().split("\n")[-1] == "False []"

@@ -1,0 +1,190 @@
+"""Pictures of what one surface shows, for finishes to look them up elsewhere than at the pixel itself, and wider than it."""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+
+from warp_reflect import launch
+from warp_reflect.layers import MirrorPixels
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Pyramid:
+    """Pictures over the bounds of a surface's pixels, each halved again and again; empty where the surface is not seen.
+
+    Attributes:
+        color: Radiance and coverage, multiplied by the latter; picture by picture, level by level.
+        nearness: 1 / distance from the surface at level 0 of the first picture, multiplied by the coverage.
+        first: Texel at which each level starts.
+        texels: Of one picture.
+    """
+
+    color: wp.array(dtype=wp.vec4)
+    nearness: wp.array(dtype=float)
+    first: wp.array(dtype=int)
+    texels: int
+    x0: int
+    y0: int
+    width: int
+    height: int
+    levels: int
+
+
+@wp.struct
+class Texel:
+    """A look-up: radiance and nearness times the coverage, and that."""
+
+    color: wp.vec4
+    nearness: float
+
+
+@wp.func
+def texel_of(pyramid: Pyramid, pixel: int, image_width: int) -> int:
+    """Texel of level 0 of a frame's pixel within the bounds."""
+    row = pixel // image_width
+    return (row - pyramid.y0) * pyramid.width + pixel - row * image_width - pyramid.x0
+
+
+@wp.func
+def level_size(size: int, level: int) -> int:
+    """Texels along an edge that has `size` of them at level 0."""
+    return wp.max((size + (1 << level) - 1) >> level, 1)
+
+
+@wp.func
+def level_of(pyramid: Pyramid, width: float) -> int:
+    """Level whose texels are about as wide as a look-up of some pixels."""
+    return wp.clamp(int(wp.log2(wp.max(width, 1.0)) + 0.5), 0, pyramid.levels - 1)
+
+
+@wp.func
+def look_up(pyramid: Pyramid, x: float, y: float) -> Texel:
+    """Bilinear look-up in the first picture at a pixel coordinate relative to the bounds; nothing beyond them."""
+    sx = x - 0.5
+    sy = y - 0.5
+    x0 = int(wp.floor(sx))
+    y0 = int(wp.floor(sy))
+    found = Texel()
+    for k in range(4):
+        tx = x0 + k % 2
+        ty = y0 + k // 2
+        if tx >= 0 and ty >= 0 and tx < pyramid.width and ty < pyramid.height:
+            share = (1.0 - wp.abs(sx - float(tx))) * (1.0 - wp.abs(sy - float(ty)))
+            texel = ty * pyramid.width + tx
+            found.color += share * pyramid.color[texel]
+            found.nearness += share * pyramid.nearness[texel]
+    return found
+
+
+@wp.func
+def look_up_level(pyramid: Pyramid, picture: int, x: float, y: float, level: int) -> wp.vec4:
+    """Bilinear look-up of a picture's colour at a level; nothing beyond the bounds."""
+    width = level_size(pyramid.width, level)
+    height = level_size(pyramid.height, level)
+    scale = 1.0 / float(1 << level)
+    sx = x * scale - 0.5
+    sy = y * scale - 0.5
+    x0 = int(wp.floor(sx))
+    y0 = int(wp.floor(sy))
+    start = picture * pyramid.texels + pyramid.first[level]
+    found = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    for k in range(4):
+        tx = x0 + k % 2
+        ty = y0 + k // 2
+        if tx >= 0 and ty >= 0 and tx < width and ty < height:
+            share = (1.0 - wp.abs(sx - float(tx))) * (1.0 - wp.abs(sy - float(ty)))
+            found += share * pyramid.color[start + ty * width + tx]
+    return found
+
+
+@wp.kernel
+def fill_kernel(
+    first: int,
+    image_width: int,
+    pixel: wp.array(dtype=int),
+    radiance: wp.array(dtype=wp.vec3),
+    nearness: wp.array(dtype=float),
+    out_pyramid: Pyramid,
+):
+    """One thread per pixel."""
+    i = first + wp.tid()
+    texel = texel_of(out_pyramid, pixel[i], image_width)
+    out_pyramid.color[texel] = wp.vec4(radiance[i][0], radiance[i][1], radiance[i][2], 1.0)
+    out_pyramid.nearness[texel] = nearness[i]
+
+
+@wp.kernel
+def halve_kernel(first: int, level: int, out_pyramid: Pyramid):
+    """One thread per texel of a level of all pictures: the mean of four of the level before."""
+    i = first + wp.tid()
+    width = level_size(out_pyramid.width, level)
+    count = width * level_size(out_pyramid.height, level)
+    start = (i // count) * out_pyramid.texels
+    texel = i % count
+    y = texel // width
+    x = texel - y * width
+    finer_width = level_size(out_pyramid.width, level - 1)
+    finer_height = level_size(out_pyramid.height, level - 1)
+    color = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    for k in range(4):
+        fx = 2 * x + k % 2
+        fy = 2 * y + k // 2
+        if fx < finer_width and fy < finer_height:
+            color += 0.25 * out_pyramid.color[start + out_pyramid.first[level - 1] + fy * finer_width + fx]
+    out_pyramid.color[start + out_pyramid.first[level] + texel] = color
+
+
+def make_picture(
+    pixels: MirrorPixels, radiance: wp.array, nearness: wp.array, image_width: int, threads: int = 0
+) -> Pyramid:
+    """The picture of what a surface's pixels see, at level 0 alone.
+
+    Args:
+        pixels: At which the surface is seen.
+        radiance: vec3 [n].
+        nearness: float [n], 1 / distance from the surface, 0 for the sky.
+        image_width: Of the frame. [pixels]
+        threads: CPU threads; 0: one per core.
+    """
+    pyramid = empty_pyramid(pixels, radiance.device)
+    pyramid.nearness = wp.zeros(pyramid.texels, dtype=float, device=radiance.device)
+    launch.launch(
+        fill_kernel, pixels.count, [image_width, pixels.pixel, radiance, nearness, pyramid], radiance.device, threads
+    )
+    return pyramid
+
+
+def empty_pyramid(pixels: MirrorPixels, device, pictures: int = 1, levels: int = 1) -> Pyramid:
+    """Room for pictures of a surface.
+
+    Args:
+        pixels: At which the surface is seen.
+        device: Where.
+        pictures: Number of them.
+        levels: At most so many; 1: no halves.
+    """
+    x0, y0, x1, y1 = pixels.box
+    width, height = x1 - x0, y1 - y0
+    levels = min(levels, max(width, height).bit_length())
+    pyramid = Pyramid()
+    pyramid.x0, pyramid.y0, pyramid.width, pyramid.height, pyramid.levels = x0, y0, width, height, levels
+    sizes = [_level_texels(pyramid, level) for level in range(levels)]
+    pyramid.texels = sum(sizes)
+    pyramid.color = wp.zeros(pictures * pyramid.texels, dtype=wp.vec4, device=device)
+    pyramid.nearness = wp.zeros(0, dtype=float, device=device)
+    pyramid.first = wp.array(np.cumsum([0, *sizes[:-1]]).astype(np.int32), dtype=int, device=device)
+    return pyramid
+
+
+def halve(pyramid: Pyramid, pictures: int, device, threads: int = 0) -> None:
+    """Fill the levels above the first."""
+    for level in range(1, pyramid.levels):
+        launch.launch(halve_kernel, pictures * _level_texels(pyramid, level), [level, pyramid], device, threads)
+
+
+def _level_texels(pyramid: Pyramid, level: int) -> int:
+    edges = (max((size + (1 << level) - 1) >> level, 1) for size in (pyramid.width, pyramid.height))
+    return int(np.prod(list(edges)))

@@ -1,0 +1,280 @@
+"""Water: the pictures of a still surface, mirrored and refracted, looked up where its waves turn the rays.
+
+Source: McTaggart, Half-Life 2 / Valve Source Shading, GDC 2004, as told in Akenine-Moller, Haines, Hoffman, Real-Time
+Rendering, 3rd edition, section 9.3.1: the reflected and the refracted picture are rendered for the flat surface, and a normal
+map shifts where they are looked up. Differs from it by: the shift is not the normal times a constant, but the projection of
+the point that the turned ray meets at the height over the surface that the still picture shows there, found step by step; for
+the refracted picture through Snell's law at the flat surface. (A constant is off by tens of pixels where this is off by
+hundredths, but for what the still picture does not show.) Look-ups that would leave the surface at a shore, or the frame, are
+drawn back towards their own pixel.
+
+`waves=traced` follows the turned rays instead: the reference.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from warp_reflect import bvh, launch, shade
+from warp_reflect.finishes.pyramid import Pyramid, look_up, make_picture
+from warp_reflect.layers import CameraView, MirrorPixels, ReflectionLayer
+from warp_reflect.optics import refract
+from warp_reflect.scene import Scene, SceneView
+from warp_reflect.shapes import facet_normal, unit
+from warp_reflect.surface import shown_normal
+from warp_reflect.transmission import Through, Transmission, look_through, through_radiance
+
+wp.set_module_options({"enable_backward": False})
+
+SEARCH_STEPS = wp.constant(3)
+SNELL_STEPS = wp.constant(4)  # Newton's, from the still picture's own point: waves move it by little
+RETREATS = wp.constant(4)  # halvings of a shift that leaves the surface
+LEAST_NEARNESS = wp.constant(1.0e-6)  # of the eye's own: what is further is as good as infinitely far
+LEAST_DEPTH = wp.constant(1.0e-6)
+EVEN_COVERAGE = wp.constant(0.5)  # of the four texels of a look-up: a shore's own pixels count, not what is beyond
+
+
+@wp.func
+def seen_at(camera: CameraView, p_eye: wp.vec3, own: wp.vec2) -> wp.vec2:
+    """Pixel coordinates of a point of the eye frame; `own` where it is not before the eye."""
+    w = camera.w_row[0] * p_eye[0] + camera.w_row[1] * p_eye[1] + camera.w_row[2] * p_eye[2] + camera.w_row[3]
+    if not (w > LEAST_DEPTH * wp.length(p_eye)):
+        return own
+    x = camera.x_row[0] * p_eye[0] + camera.x_row[1] * p_eye[1] + camera.x_row[2] * p_eye[2] + camera.x_row[3]
+    y = camera.y_row[0] * p_eye[0] + camera.y_row[1] * p_eye[1] + camera.y_row[2] * p_eye[2] + camera.y_row[3]
+    return wp.vec2(x / w, y / w)
+
+
+@wp.func
+def shifted_radiance(pyramid: Pyramid, own: wp.vec2, at: wp.vec2, otherwise: wp.vec3) -> wp.vec3:
+    """The picture at a place; nearer to the pixel's own where the surface is not seen there."""
+    shift = at - own
+    for _step in range(RETREATS):
+        found = look_up(pyramid, own[0] + shift[0], own[1] + shift[1])
+        if found.color[3] >= EVEN_COVERAGE:
+            return wp.vec3(found.color[0], found.color[1], found.color[2]) / found.color[3]
+        shift = 0.5 * shift
+    return otherwise
+
+
+@wp.func
+def turned_reflection(direction: wp.vec3, n: wp.vec3, wave: wp.vec3) -> wp.vec3:
+    """Where a wave's normal reflects what the still surface reflects along `direction`; never into the surface."""
+    incident = direction - 2.0 * wp.dot(direction, n) * n
+    turned = incident - 2.0 * wp.dot(incident, wave) * wave
+    into = wp.min(wp.dot(turned, n), 0.0)
+    return unit(turned - 2.0 * into * n)
+
+
+@wp.kernel
+def mirrored_height_kernel(
+    first: int,
+    triangle: wp.array(dtype=int),
+    distance: wp.array(dtype=float),
+    direction: wp.array(dtype=wp.vec3),
+    normal: wp.array(dtype=wp.vec3),
+    out_nearness: wp.array(dtype=float),
+):
+    """One thread per mirror pixel: 1 / height of what it shows over the surface, 0 for the sky."""
+    i = first + wp.tid()
+    out_nearness[i] = 0.0
+    height = distance[i] * wp.abs(wp.dot(direction[i], normal[i]))
+    if triangle[i] >= 0 and height > 0.0:
+        out_nearness[i] = 1.0 / height
+
+
+@wp.kernel
+def refracted_depth_kernel(
+    first: int,
+    nearness: wp.array(dtype=float),
+    direction: wp.array(dtype=wp.vec3),
+    normal: wp.array(dtype=wp.vec3),
+    out_nearness: wp.array(dtype=float),
+):
+    """One thread per pixel: 1 / depth of what it shows below the surface."""
+    i = first + wp.tid()
+    out_nearness[i] = nearness[i] / wp.max(wp.abs(wp.dot(direction[i], normal[i])), LEAST_DEPTH)
+
+
+@wp.kernel
+def reflect_waves_kernel(
+    first: int,
+    camera: CameraView,
+    normals: wp.array(dtype=wp.vec3),
+    pyramid: Pyramid,
+    # Mirror pixels:
+    pixel: wp.array(dtype=int),
+    point: wp.array(dtype=wp.vec3),
+    normal: wp.array(dtype=wp.vec3),
+    direction: wp.array(dtype=wp.vec3),
+    nearness: wp.array(dtype=float),
+    radiance: wp.array(dtype=wp.vec3),
+    out_radiance: wp.array(dtype=wp.vec3),
+):
+    """One thread per mirror pixel."""
+    i = first + wp.tid()
+    row = pixel[i] // camera.width
+    corner = wp.vec2(float(pyramid.x0), float(pyramid.y0))
+    own = wp.vec2(float(pixel[i] - row * camera.width) + 0.5, float(row) + 0.5)
+    n = normal[i]
+    to_point = point[i] - camera.eye
+    turned = turned_reflection(direction[i], n, shown_normal(normals, pixel[i], n))
+    # What the turned ray meets stands, to the eye, where its mirror image in the still plane does.
+    behind = turned - 2.0 * wp.dot(turned, n) * n
+    least = LEAST_NEARNESS / wp.max(wp.length(to_point), LEAST_DEPTH)
+    near = nearness[i]
+    rise = wp.dot(turned, n)
+    at = own
+    for _step in range(SEARCH_STEPS):
+        at = seen_at(camera, to_point + behind / wp.max(near * rise, least), own)
+        found = look_up(pyramid, at[0] - corner[0], at[1] - corner[1])
+        if found.color[3] >= EVEN_COVERAGE:
+            near = found.nearness / found.color[3]
+    out_radiance[i] = shifted_radiance(pyramid, own - corner, at - corner, radiance[i])
+
+
+@wp.func
+def crossing_point(to_point: wp.vec3, n: wp.vec3, target: wp.vec3, ior: float) -> wp.vec3:
+    """Where an eye at the origin sees a point behind a flat interface: the point of the interface on its way.
+
+    Args:
+        to_point: A point of the interface near it.
+        n: Unit normal on the eye's side.
+        target: The point behind.
+        ior: Index of refraction behind the interface over that before it.
+    """
+    height = -wp.dot(to_point, n)
+    depth = wp.max(-wp.dot(target - to_point, n), 0.0)
+    across = target - wp.dot(target, n) * n
+    length = wp.length(across)
+    if not (length > 0.0):
+        return -height * n
+    s = wp.clamp(wp.length(to_point + height * n), 0.0, length)
+    for _step in range(SNELL_STEPS):
+        left = length - s
+        before = wp.sqrt(s * s + height * height)
+        after = wp.sqrt(left * left + depth * depth)
+        if not (before > 0.0 and after > 0.0):
+            break
+        residual = s / before - ior * left / after
+        slope = height * height / (before * before * before) + ior * depth * depth / (after * after * after)
+        if not (slope > 0.0):
+            break
+        s = wp.clamp(s - residual / slope, 0.0, length)
+    return (s / length) * across - height * n
+
+
+@wp.kernel
+def refract_waves_kernel(
+    first: int,
+    scene: SceneView,
+    camera: CameraView,
+    normals: wp.array(dtype=wp.vec3),
+    triangle: wp.array(dtype=int),
+    ior: float,
+    pyramid: Pyramid,
+    # Pixels of the surface, with the normals on the far side:
+    pixel: wp.array(dtype=int),
+    point: wp.array(dtype=wp.vec3),
+    normal: wp.array(dtype=wp.vec3),
+    nearness: wp.array(dtype=float),
+    radiance: wp.array(dtype=wp.vec3),
+    out_radiance: wp.array(dtype=wp.vec3),
+):
+    """One thread per pixel of the surface; an eye behind it has its turned rays already."""
+    i = first + wp.tid()
+    out_radiance[i] = radiance[i]
+    tri = scene.triangles[triangle[pixel[i]]]
+    outward = facet_normal(scene.points[tri[0]], scene.points[tri[1]], scene.points[tri[2]])
+    n = -normal[i]
+    if wp.dot(outward, n) <= 0.0:
+        return
+    row = pixel[i] // camera.width
+    corner = wp.vec2(float(pyramid.x0), float(pyramid.y0))
+    own = wp.vec2(float(pixel[i] - row * camera.width) + 0.5, float(row) + 0.5)
+    to_point = point[i] - camera.eye
+    incident = camera.forward
+    if camera.orthographic == 0:
+        incident = unit(to_point)
+    bent = refract(incident, shown_normal(normals, pixel[i], n), ior)
+    if not (wp.dot(bent, n) < 0.0):
+        return
+    bent = unit(bent)
+    still = refract(incident, n, ior)
+    least = LEAST_NEARNESS / wp.max(wp.length(to_point), LEAST_DEPTH)
+    near = nearness[i]
+    at = own
+    for _step in range(SEARCH_STEPS):
+        target = to_point - bent / wp.min(near * wp.dot(bent, n), -least)
+        if camera.orthographic == 0:
+            at = seen_at(camera, crossing_point(to_point, n, target, ior), own)
+        else:
+            way = wp.dot(target - to_point, n) / wp.dot(still, n)
+            at = seen_at(camera, target - way * still, own)
+        found = look_up(pyramid, at[0] - corner[0], at[1] - corner[1])
+        if found.color[3] >= EVEN_COVERAGE:
+            near = found.nearness / found.color[3]
+    out_radiance[i] = shifted_radiance(pyramid, own - corner, at - corner, radiance[i])
+
+
+@wp.kernel
+def turn_kernel(
+    first: int,
+    normals: wp.array(dtype=wp.vec3),
+    pixel: wp.array(dtype=int),
+    normal: wp.array(dtype=wp.vec3),
+    direction: wp.array(dtype=wp.vec3),
+    out_direction: wp.array(dtype=wp.vec3),
+):
+    """One thread per mirror pixel."""
+    i = first + wp.tid()
+    out_direction[i] = turned_reflection(direction[i], normal[i], shown_normal(normals, pixel[i], normal[i]))
+
+
+def apply(
+    scene: Scene, shown: shade.Shown, layer: ReflectionLayer, sharp: wp.array, radiance: wp.array, row
+) -> wp.array:
+    """What a mirror with waves shows, see `finishes`. Maps are looked up either way: they show no place to trace to."""
+    pixels, threads, device = layer.pixels, row.settings.threads, scene.device
+    if row.settings.waves == "traced" and layer.radiance is None:
+        return traced(scene, shown, layer, row)
+    nearness = wp.empty(pixels.count, dtype=float, device=device)
+    hits = [layer.triangle, layer.distance, pixels.direction, pixels.normal, nearness]
+    launch.launch(mirrored_height_kernel, pixels.count, hits, device, threads)
+    picture = make_picture(pixels, radiance, nearness, shown.gbuffer.camera.size[0], threads)
+    wavy = wp.empty(pixels.count, dtype=wp.vec3, device=device)
+    inputs = [shown.gbuffer.view, shown.normals, picture, pixels.pixel, pixels.point, pixels.normal, pixels.direction]
+    launch.launch(reflect_waves_kernel, pixels.count, [*inputs, nearness, radiance, wavy], device, threads)
+    return wavy
+
+
+def traced(scene: Scene, shown: shade.Shown, layer: ReflectionLayer, row) -> wp.array:
+    """What the rays see that the waves turn."""
+    pixels, settings = layer.pixels, row.settings
+    direction = wp.empty(pixels.count, dtype=wp.vec3, device=scene.device)
+    inputs = [shown.normals, pixels.pixel, pixels.normal, pixels.direction, direction]
+    launch.launch(turn_kernel, pixels.count, inputs, scene.device, settings.threads)
+    turned = MirrorPixels(pixels.reflector, pixels.pixel, pixels.point, pixels.normal, direction, pixels.box)
+    answer = ReflectionLayer.empty(turned, layer.method, scene.device)
+    # A flat mirror never sees itself.
+    bvh.trace_pixels(scene, shown.gbuffer, turned, answer, row.reflector.part, True, threads=settings.threads)
+    return shown.seen(answer)
+
+
+def apply_through(scene: Scene, through: Through, found: Transmission, radiance: wp.array, pane) -> wp.array:
+    """What is seen through a surface with waves, see `finishes`."""
+    pixels, settings, shown = found.layer.pixels, pane.settings, through.shown
+    if settings.waves == "traced":
+        turned = look_through(scene, shown, through.interfaces, pixels.pixel.numpy(), settings, wavy=True)
+        found.layer, found.nearness = turned.layer, turned.nearness
+        return through_radiance(scene, through, found, settings)
+    nearness = wp.empty(pixels.count, dtype=float, device=scene.device)
+    ways = [found.nearness, pixels.direction, pixels.normal, nearness]
+    launch.launch(refracted_depth_kernel, pixels.count, ways, scene.device, settings.threads)
+    picture = make_picture(pixels, radiance, nearness, shown.gbuffer.camera.size[0], settings.threads)
+    wavy = wp.empty(pixels.count, dtype=wp.vec3, device=scene.device)
+    ior = scene.data.materials[scene.parts[pane.part].material].ior
+    inputs = [scene.view, shown.gbuffer.view, shown.normals, shown.gbuffer.triangle, ior, picture]
+    inputs += [pixels.pixel, pixels.point, pixels.normal, nearness, radiance, wavy]
+    launch.launch(refract_waves_kernel, pixels.count, inputs, scene.device, settings.threads)
+    return wavy
