@@ -21,6 +21,7 @@ from scene_curved import CURVED_SCENES
 from scene_parts import STAND_BEAD, STAND_RING
 from scene_sets import WALLS, arena, boxes, corner, play_room, play_things, studio
 from scene_shapes import Detail, block, merge, patch, revolve, sheet
+from scene_water import WATER_SCENES
 from scene_writer import MIRROR_DIGITS, Recipe, Writer, new_stage
 
 
@@ -415,6 +416,7 @@ SCENES = {
         ("/World/Mirror",),
     ),
     **CURVED_SCENES,
+    **WATER_SCENES,
 }
 
 

@@ -37,6 +37,8 @@ class Look:
     metallic: float = 0.0
     roughness: float = 0.5
     emissive: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    opacity: float = 1.0
+    ior: float = 1.5
 
 
 LOOKS = {
@@ -75,6 +77,10 @@ LOOKS = {
     "Sandstone": Look((0.62, 0.45, 0.27)),
     "Rubber": Look((0.03, 0.03, 0.035)),
     "Lamp": Look((0.5, 0.5, 0.5), emissive=(1.4, 1.2, 0.85)),
+    "BlackMarble": Look((0.25, 0.25, 0.27), 1.0, 0.0),
+    "Glass": Look((1.0, 1.0, 1.0), 0.0, 0.0, opacity=0.0),
+    "FrostedGlass": Look((1.0, 1.0, 1.0), 0.0, 0.5, opacity=0.15),
+    "Water": Look((1.0, 1.0, 1.0), 0.0, 0.0, opacity=0.0, ior=1.333),
 }
 
 

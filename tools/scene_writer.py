@@ -201,7 +201,9 @@ def define_material(stage: Usd.Stage, path: Sdf.Path, look: Look) -> UsdShade.Ma
     shader.CreateInput("diffuseColor", color).Set(Gf.Vec3f(*look.color))
     shader.CreateInput("metallic", number).Set(look.metallic)
     shader.CreateInput("roughness", number).Set(look.roughness)
-    shader.CreateInput("ior", number).Set(1.5)
+    shader.CreateInput("ior", number).Set(look.ior)
+    if look.opacity < 1.0:
+        shader.CreateInput("opacity", number).Set(look.opacity)
     if any(look.emissive):
         shader.CreateInput("emissiveColor", color).Set(Gf.Vec3f(*look.emissive))
     material.CreateSurfaceOutput().ConnectToSource(shader.CreateOutput("surface", Sdf.ValueTypeNames.Token))
