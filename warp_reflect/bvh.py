@@ -444,11 +444,12 @@ class Tracer:
     Attributes:
         id: Handle for `trace_ray`; valid while this object lives. 0 for a scene without triangles, which has
             no structure and must not be queried.
+        origin: float64 [3]; rays are those of the frame world - origin.
     """
 
     def __init__(self, scene: Scene, part: int | None = None, seen: np.ndarray | None = None):
         # Not the scene itself, which owns this: the pair would wait for the garbage collector, a scene a frame.
-        self._device, self._view = scene.device, scene.view
+        self._device, self._view, self.origin = scene.device, scene.view, scene.origin
         self._mesh = None
         triangles = scene.host_triangles
         if part is not None:

@@ -487,6 +487,14 @@ def empty_maps(scene: Scene, centres: np.ndarray, axes: np.ndarray, resolution: 
     return CubeMaps(view, centres, axes)
 
 
+def copied_maps(maps: CubeMaps) -> CubeMaps:
+    """Maps whose texels can be changed and those of the others stay; not of packed ones."""
+    view = _copied(maps.view)
+    for name in ("radiance", "distance", "triangle"):
+        setattr(view, name, wp.clone(getattr(maps.view, name)))
+    return CubeMaps(view, maps.centres, maps.axes)
+
+
 def _copied(view: CubeMapsView) -> CubeMapsView:
     """Another struct with the same arrays."""
     other = CubeMapsView()
@@ -518,17 +526,23 @@ def _draw_face(scene, camera, maps, k, face, without, onward, shadows, threads) 
     """Draw, shade and store one face."""
     device, count = scene.device, camera.size[0] * camera.size[1]
     gbuffer = raster.draw_scene(scene, camera, threads, without)
-    point, direction = (wp.zeros(count, dtype=wp.vec3, device=device) for _ in range(2))
-    u, v, distance = (wp.zeros(count, dtype=float, device=device) for _ in range(3))
-    inputs = [scene.view, gbuffer.view, gbuffer.triangle, point, direction, u, v, distance]
-    launch.launch(texel_hits_kernel, count, inputs, device, threads)
-    layer = hits_layer(point, direction, gbuffer.triangle, u, v)
+    layer, distance = texel_hits(scene, gbuffer, threads)
     radiance = shade.seen_radiance(scene, gbuffer, layer, threads, shadows)
     if onward is not None:
         onward(gbuffer, layer, radiance)
     view = maps.view
     places = [k * view.map_texels + face * count, (k * FACE_COUNT + face) * count]
     launch.launch(store_texels_kernel, count, [gbuffer.triangle, radiance, distance, *places, view], device, threads)
+
+
+def texel_hits(scene: Scene, gbuffer: GBuffer, threads: int = 0) -> tuple[ReflectionLayer, wp.array]:
+    """What the texels of a drawn face see, to be shaded, and the distances to it (float32, 0 sky)."""
+    device, count = scene.device, len(gbuffer.triangle)
+    point, direction = (wp.zeros(count, dtype=wp.vec3, device=device) for _ in range(2))
+    u, v, distance = (wp.zeros(count, dtype=float, device=device) for _ in range(3))
+    inputs = [scene.view, gbuffer.view, gbuffer.triangle, point, direction, u, v, distance]
+    launch.launch(texel_hits_kernel, count, inputs, device, threads)
+    return hits_layer(point, direction, gbuffer.triangle, u, v), distance
 
 
 def hits_layer(point: wp.array, direction: wp.array, triangle: wp.array, u: wp.array, v: wp.array) -> ReflectionLayer:

@@ -12,7 +12,7 @@ top-left rule); 8 sub-pixel bits as there.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -596,15 +596,36 @@ def draw_scene(
         without: Parts that are left out, indices into `scene.parts`.
         kernels: `Settings.kernels`.
     """
-    device = scene.device
-    view = camera.view(scene)
+    kept = kept_triangles(scene, without)
+    drawn = [(scene.view.triangles[first:end], first) for first, end in kept]
+    return draw_triangles(camera, camera.view(scene), scene.view.points, drawn, threads, kernels)
+
+
+def draw_triangles(
+    camera: Camera,
+    view: CameraView,
+    points: wp.array,
+    drawn: Sequence[tuple[wp.array, wp.array | int]],
+    threads: int = 0,
+    kernels: str = "auto",
+) -> GBuffer:
+    """The eye view of some triangles.
+
+    Args:
+        camera, view: From where; the view in the frame of the points.
+        points: vec3.
+        drawn: (vec3i triangles, indices into `points`; what the picture holds of each: numbers, or that of the first).
+        threads: CPU threads; 0: one per core.
+        kernels: `Settings.kernels`.
+    """
+    device = points.device
     width, height = camera.size
     target = make_target(view, (0, 0, width, height), device)
-    screen = wp.empty(scene.vertex_count, dtype=wp.vec4, device=device)
-    launch(project_kernel, scene.vertex_count, [scene.view.points, view, screen], device, threads)
-    for first, end in kept_triangles(scene, without):
-        triangles = scene.view.triangles[first:end]
-        rasterise(target, screen, triangles, id_offset=first, threads=threads, kernels=kernels)
+    screen = wp.empty(len(points), dtype=wp.vec4, device=device)
+    launch(project_kernel, len(points), [points, view, screen], device, threads)
+    for triangles, ids in drawn:
+        named = {"id_offset": ids} if isinstance(ids, int) else {"ids": ids}
+        rasterise(target, screen, triangles, **named, threads=threads, kernels=kernels)
     triangle = wp.empty(width * height, dtype=int, device=device)
     depth_key = wp.empty(width * height, dtype=float, device=device)
     launch(resolve_kernel, width * height, [target.key, triangle, depth_key], device, threads)

@@ -490,6 +490,19 @@ class Scene:
             still[part.first_triangle : part.first_triangle + part.triangle_count] = False
         return bvh.Tracer(self, seen=still)
 
+    def with_still_rays(self) -> Scene:
+        """The same scene whose rays, those of shadows too, meet nothing that moves."""
+        if not self.moving_parts:
+            return self
+        other = copy.copy(self)
+        other.tracer = self.still_tracer
+        return other
+
+    def keep_still_tracer(self, earlier: Scene) -> None:
+        """Take `still_tracer` over from the same stage's scene at another time, whose triangles have the same numbers."""
+        if self.moving_parts and "still_tracer" in vars(earlier):
+            self.still_tracer = earlier.still_tracer
+
     @cached_property
     def lights(self):
         """The lights as kernels read them (`shade.LightView`), prepared at first use."""

@@ -122,7 +122,7 @@ class Settings:
     rem_count: int = 2
     """Reference environment maps that a texel of a local map is blended from."""
     rem_texels: str = "packed"
-    """Texels of reference environment maps: `packed` (4 bytes) or `full` (24 bytes, single precision)."""
+    """Texels of reference environment maps: `packed` (4 bytes) or `full` (20 bytes, single precision)."""
     rem_missing: str = "shade"
     """What no reference map sees is shaded where it is met (`shade`), or shows the map that would weigh most (`best`)."""
     rem_limit: int = 16
@@ -133,8 +133,8 @@ class Settings:
     """Cells along a face of a local map's mesh before it is refined, at least."""
     depth_ratio: float = 0.25
     """A cell whose corners' depths differ by more than this share of the nearest is refined; 0: every texel is traced."""
-    parallax_steps: int = 3
-    """Steps from a mirror's pixel to what its ray meets in a local map; 0: looked up by direction alone."""
+    parallax_steps: int = 12
+    """Steps along a mirror pixel's ray at which a local map is asked what it meets; 0: looked up by direction alone."""
     walk_hops: int = 4
     """Neighbour triangles a refinement may walk over before the BVH decides."""
     complexity: str = "low"

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from warp_reflect import bvh, raster, surface
-from warp_reflect.environment_maps import CubeMaps, look_up, render_maps
+from warp_reflect.environment_maps import CubeMaps, Onward, look_up, render_maps
 from warp_reflect.layers import Camera, GBuffer, MirrorPixels, ReflectionLayer
 from warp_reflect.scene import Scene
 from warp_reflect.settings import Settings, Status, Technique
@@ -112,20 +112,29 @@ def reflect(
 
 
 def _draw(scene: Scene, part: int, centre: np.ndarray, settings: Settings, before=None) -> tuple[CubeMaps, int]:
-    if settings.bounces > 1 or before:
+    resolution = settings.environment_resolution
+    options = {"shadows": asked_shadows(scene, settings), "threads": settings.threads}
+    onward = onward_of(scene, settings, before)
+    return render_maps(scene, centre[None], resolution, without=[left_out(scene, part)], onward=onward, **options), 0
+
+
+def onward_of(scene: Scene, settings: Settings, before: dict[int, Shown] | None = None) -> Onward | None:
+    """What mirrors seen in a map show: maps of their own, as `bounces` and `environment_update` ask; None: the domes.
+
+    Args:
+        before: By reflector id the maps of the previous frame, where that is what is asked for.
+    """
+    if settings.environment_update == "previous":
+        if not before:
+            return None  # the first frame
         from warp_reflect.techniques import mirror_maps
 
-        if before:
-            onward = mirror_maps.of_previous_frame(scene, before)
-        elif settings.environment_update == "previous":
-            onward = None  # the first frame
-        else:
-            onward = mirror_maps.of_depth(scene, settings, settings.bounces - 1)
-    else:
-        onward = None
-    resolution = settings.environment_resolution
-    options = {"onward": onward, "shadows": asked_shadows(scene, settings), "threads": settings.threads}
-    return render_maps(scene, centre[None], resolution, without=[left_out(scene, part)], **options), 0
+        return mirror_maps.of_previous_frame(scene, before)
+    if settings.bounces <= 1:
+        return None
+    from warp_reflect.techniques import mirror_maps
+
+    return mirror_maps.of_depth(scene, settings, settings.bounces - 1)
 
 
 def parallax_px(scene: Scene, reflector, camera: Camera, threads: int = 0) -> float:

@@ -2,9 +2,9 @@
 
 Source: Meyer and Loscos, Real-Time Reflection on Moving Vehicles in Urban Environments, VRST 2003. `reference_maps.py` has
 the maps, `local_map.py` the local map. Differs from it by: a mirror's pixel is not looked up by its reflected direction
-alone, but by where its own ray meets what the local map holds, found in a few steps from texel to texel (after
-Szirmay-Kalos et al., Approximate Ray-Tracing on the GPU with Distance Impostors, Eurographics 2005; here against the plane
-of the triangle that the texel holds, exact where it settles).
+alone, but by where its own ray meets what the local map holds: the triangles of the texels that it passes, seen from the
+map's eye, are asked, and the nearest that it hits is shown (after Szirmay-Kalos et al., Approximate Ray-Tracing on the GPU
+with Distance Impostors, Eurographics 2005, who have distances only; a triangle's hit is exact).
 """
 
 from __future__ import annotations
@@ -21,9 +21,10 @@ from warp_reflect.layers import Camera, GBuffer, MirrorPixels, ReflectionLayer
 from warp_reflect.scene import Note, Scene, SceneView
 from warp_reflect.settings import Settings, Status, Technique
 from warp_reflect.shade import LightView
-from warp_reflect.shapes import clamp_weights, intersect_triangle, unit
-from warp_reflect.techniques import local_map, reference_maps
-from warp_reflect.techniques.environment import centre_of
+from warp_reflect.shapes import TriangleHit, clamp_weights, intersect_triangle, unit
+from warp_reflect.techniques import local_map, local_movers, reference_maps
+from warp_reflect.techniques.environment import Shown, centre_of, onward_of
+from warp_reflect.techniques.local_movers import moving_in
 from warp_reflect.techniques.reference_maps import ReferenceMaps, take_over
 
 __all__ = ["applies", "plan_notes", "prepare", "reflect", "take_over"]
@@ -35,18 +36,25 @@ SKY = wp.constant(int(Status.SKY))
 HIDDEN = wp.constant(int(Status.HIDDEN))
 MAX_ITERATIONS = wp.constant(int(Status.MAX_ITERATIONS))
 MISSING = wp.constant(local_map.TEXEL_MISSING)
+PLANE_STEPS = wp.constant(3)  # from texel to texel; walls settle in one or two
 CANDIDATES_PER_MAP = 2  # maps that are looked at for each that is blended, where more than two are
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """A mirror's local map at `centre` (world, float64 [3]), the state of its texels, and what building it met."""
+    """A mirror's local map at `centre` (world, float64 [3]) and what building it met.
+
+    Attributes:
+        state: Of its texels, see `local_map.blend_local_map`.
+        movers: Parts that move and that it may show.
+    """
 
     part: int
     centre: np.ndarray
     references: ReferenceMaps
     local: CubeMaps
     state: wp.array
+    movers: tuple[int, ...] = ()
     statistics: dict = field(default_factory=dict)
     timings: dict = field(default_factory=dict)
 
@@ -89,7 +97,7 @@ def prepare(scene: Scene, reflector, settings: Settings) -> Prepared:
     references = reference_maps.reference_maps(scene, settings)
     centre = centre_of(scene, part)
     start = perf_counter()
-    intersect = intersect_scene(scene, part, centre, settings.threads)
+    intersect = intersect_still(scene, part, centre, settings.threads)
     mesh = local_map.trace_depth_mesh(
         settings.environment_resolution,
         intersect,
@@ -103,17 +111,25 @@ def prepare(scene: Scene, reflector, settings: Settings) -> Prepared:
     local, state, statistics = local_map.blend_local_map(
         scene, centre, mesh, intersect, references.maps, rems, settings
     )
-    timings = {"local_rays": 1e3 * (traced - start), "local_blend": 1e3 * (perf_counter() - traced)}
+    blended = perf_counter()
+    movers = moving_in(scene, part)
+    if movers and settings.environment_update != "previous":
+        onward = onward_of(scene, settings)
+        local, state, moved = local_movers.draw_moving(scene, local, state, movers, onward, settings)
+        statistics |= moved
+    drawn = perf_counter()
+    timings = {"local_rays": traced - start, "local_blend": blended - traced, "local_moving": drawn - blended}
     beyond = _beyond(scene, part, references.placement.centres, references.reach)
     scene.notes += [note for note in beyond if note not in scene.notes]
-    return Prepared(part, centre, references, local, state, mesh.statistics | statistics, timings)
+    timings = {name: 1e3 * seconds for name, seconds in timings.items()}
+    return Prepared(part, centre, references, local, state, movers, mesh.statistics | statistics, timings)
 
 
-def intersect_scene(scene: Scene, part: int, centre: np.ndarray, threads: int) -> local_map.Intersect:
-    """Rays from a mirror's centre through the scene's BVH, the mirror itself left out: exact."""
-    origin = centre - scene.origin
-    body = bvh.body_of(scene, part, convex=True)
-    tracer = scene.mirror_tracer(part)
+def intersect_still(scene: Scene, part: int, centre: np.ndarray, threads: int) -> local_map.Intersect:
+    """Rays from a mirror's centre through the BVH of what never moves, the mirror itself left out: exact."""
+    tracer = scene.still_tracer
+    origin = centre - tracer.origin
+    body = bvh.body_of(scene, -1 if part in scene.moving_parts else part, convex=True)
 
     def intersect(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         triangle, t, _, _ = tracer.trace(np.tile(origin, (len(directions), 1)), directions, threads, body)
@@ -137,6 +153,13 @@ def _beyond(scene: Scene, part: int, centres: np.ndarray, reach: float) -> list[
     return [Note(scene.parts[part].prim_path, text)]
 
 
+@wp.func
+def intersect_texel(scene: SceneView, triangle: int, origin: wp.vec3, ray: wp.vec3) -> TriangleHit:
+    """A ray against the triangle that a texel holds."""
+    corner = scene.triangles[triangle]
+    return intersect_triangle(origin, ray, scene.points[corner[0]], scene.points[corner[1]], scene.points[corner[2]])
+
+
 @wp.kernel
 def look_up_kernel(
     first: int,
@@ -156,7 +179,7 @@ def look_up_kernel(
     out_radiance: wp.array(dtype=wp.vec3),
     out_settled: wp.array(dtype=wp.uint8),
 ):
-    """One thread per mirror pixel: from texel to texel to where its ray meets what the local map holds."""
+    """One thread per mirror pixel: to what the local map holds that its ray meets."""
     i = first + wp.tid()
     ray = direction[i]
     start = point[i] - local.centre[0]
@@ -164,23 +187,22 @@ def look_up_kernel(
     texel = nearest_texel(local, 0, towards)
     t = local.distance[texel]
     settled = int(0)
+    found = int(-1)
+    # From the texel of its direction to where it meets the plane of what that holds, and on from there.
     step = int(0)
-    while step < steps and settled == 0 and local.distance[texel] > 0.0:
+    while step < wp.min(steps, PLANE_STEPS) and settled == 0 and local.distance[texel] > 0.0:
         step += 1
         along = float(-1.0)
         triangle = local.triangle[texel]
         if triangle >= 0:
-            corner = scene.triangles[triangle]
-            hit = intersect_triangle(
-                point[i], ray, scene.points[corner[0]], scene.points[corner[1]], scene.points[corner[2]]
-            )
+            hit = intersect_texel(scene, triangle, point[i], ray)
             if hit.det != 0.0:
                 along = hit.t
                 if hit.hit == 1 and hit.t > 0.0:
                     settled = int(1)
+                    found = triangle
                     out_u[i] = hit.u
                     out_v[i] = hit.v
-                    out_triangle[i] = triangle
         if along <= 0.0:
             # Past the plane: the sphere of the texel's distance around the centre.
             middle = wp.dot(start, ray)
@@ -192,8 +214,31 @@ def look_up_kernel(
             texel = nearest_texel(local, 0, towards)
         elif settled == 0:
             step = steps
+    # What stands before it: in steps from the mirror's point to the ray's direction, as the map's eye sees them.
+    nearest = wp.where(settled == 1, t, float(wp.inf))
+    before = int(-1)
+    step = int(0)
+    while step < steps:
+        step += 1
+        share = float(step) / float(steps + 1)
+        k = nearest_texel(local, 0, start + (wp.length(start) * share / (1.0 - share)) * ray)
+        triangle = local.triangle[k]
+        if triangle >= 0 and triangle != before and triangle != found:
+            before = triangle
+            hit = intersect_texel(scene, triangle, point[i], ray)
+            if hit.det != 0.0 and hit.hit == 1 and hit.t > 0.0 and hit.t < nearest:
+                nearest = hit.t
+                settled = int(1)
+                found = triangle
+                out_u[i] = hit.u
+                out_v[i] = hit.v
     off = float(0.0)
-    if settled == 0:
+    if settled == 1:
+        t = nearest
+        towards = start + t * ray
+        texel = nearest_texel(local, 0, towards)
+        out_triangle[i] = found
+    else:
         # What is passed on the way to the sky is where it was looked for last.
         triangle = wp.where(local.distance[texel] == 0.0, -1, local.triangle[texel])
         out_triangle[i] = triangle
@@ -202,7 +247,7 @@ def look_up_kernel(
             a = scene.points[corner[0]] - point[i]
             b = scene.points[corner[1]] - point[i]
             c = scene.points[corner[2]] - point[i]
-            hit = intersect_triangle(wp.vec3(0.0, 0.0, 0.0), ray, a, b, c)
+            hit = intersect_texel(scene, triangle, point[i], ray)
             weights = clamp_weights(hit.u, hit.v)
             if hit.det == 0.0:
                 weights = wp.vec2(1.0 / 3.0, 1.0 / 3.0)
@@ -236,25 +281,26 @@ def reflect(
 ) -> ReflectionLayer:
     """Look every mirror pixel up in the mirror's local map.
 
+    Args:
+        history: By reflector id the maps of the previous frame.
+
     Returns:
         A layer with `radiance` and status CONVERGED (what is shown lies within a texel of the reflected ray), MAX_ITERATIONS
         (it does not), HIDDEN (no reference map sees it, and it was not shaded) or SKY. Statistics: those of the local map
-        (`local_rays`, `local_discontinuities` and `..._traced`, `rem_texels`, `rem_missing`, `rem_shaded`) and
+        (`local_rays`, `local_moving`, `local_discontinuities` and `..._traced`, `rem_texels`, `rem_missing`, `rem_shaded`) and
         `local_settled`: pixels whose ray was found to hit the very triangle that the map holds.
     """
     layer = ReflectionLayer.empty(pixels, Technique.LAYERED_ENVIRONMENT, scene.device)
     layer.radiance = wp.empty(pixels.count, dtype=wp.vec3, device=scene.device)
     settled = wp.zeros(pixels.count, dtype=wp.uint8, device=scene.device)
-    inputs = [
-        scene.view,
-        scene.lights,
-        prepared.local.view,
-        prepared.state,
-        settings.parallax_steps,
-        pixels.point,
-        pixels.direction,
-    ]
+    local, state, statistics = prepared.local, prepared.state, prepared.statistics
+    if prepared.movers and settings.environment_update == "previous":
+        onward = onward_of(scene, settings, history)
+        local, state, moved = local_movers.draw_moving(scene, local, state, prepared.movers, onward, settings)
+        statistics = statistics | moved
+    inputs = [scene.view, scene.lights, local.view, state, settings.parallax_steps, pixels.point, pixels.direction]
     inputs += [layer.triangle, layer.u, layer.v, layer.distance, layer.status, layer.radiance, settled]
     launch.launch(look_up_kernel, pixels.count, inputs, scene.device, settings.threads)
-    layer.statistics = prepared.statistics | {"local_settled": int(settled.numpy().sum())}
+    layer.history = Shown(prepared.part, local, 0)
+    layer.statistics = statistics | {"local_settled": int(settled.numpy().sum())}
     return layer

@@ -30,6 +30,7 @@ from warp_reflect.cubemap import FACE_COUNT, radiance_direction, texel_direction
 from warp_reflect.environment_maps import (
     CubeMaps,
     CubeMapsView,
+    Onward,
     empty_maps,
     face_camera,
     fetch_covered,
@@ -446,13 +447,13 @@ def blend_kernel(
 
 
 @wp.kernel
-def missing_hits_kernel(
+def shaded_hits_kernel(
     first: int,
     scene: SceneView,
     eye: wp.vec3,
     resolution: int,
     texel: wp.array(dtype=int),
-    inverse: wp.array(dtype=float),
+    distance: wp.array(dtype=float),
     triangle: wp.array(dtype=int),
     # Outputs:
     out_point: wp.array(dtype=wp.vec3),
@@ -476,7 +477,7 @@ def missing_hits_kernel(
     weights = clamp_weights(hit.u, hit.v)
     if hit.det == 0.0:
         weights = wp.vec2(1.0 / 3.0, 1.0 / 3.0)
-    out_point[i] = eye + radiance_direction(face, u, v) / inverse[t]
+    out_point[i] = eye + distance[t] * direction
     out_direction[i] = direction
     out_triangle[i] = triangle[t]
     out_u[i] = weights[0]
@@ -531,20 +532,19 @@ def blend_local_map(
     eye = wp.vec3(*(centre - scene.origin))
     chosen = wp.array(np.asarray(rems, np.int32), dtype=int, device=device)
 
-    def blend(texels: np.ndarray | None) -> wp.array:
+    def blend(texels: np.ndarray | None) -> None:
         local.view.triangle = wp.array(mesh.triangle.reshape(-1), dtype=int, device=device)
         inverse = wp.array(mesh.inverse.reshape(-1), dtype=float, device=device)
         index = wp.array(np.zeros(0, np.int32) if texels is None else texels, dtype=int, device=device)
         inputs = [scene.view, scene.lights, maps.view, chosen, settings.rem_count, eye, float(slack), n, index]
         inputs += [inverse, local.view.triangle, local.view.radiance, local.view.distance, state]
         launch.launch(blend_kernel, len(state) if texels is None else len(texels), inputs, device, threads)
-        return inverse
 
-    inverse = blend(None)
+    blend(None)
     again = np.flatnonzero((state.numpy() == TEXEL_MISSING) & ~mesh.traced.reshape(-1)).astype(np.int32)
     if len(again):
         mesh.trace(again, intersect)
-        inverse = blend(again)
+        blend(again)
     found = state.numpy()
     missing = np.flatnonzero(found == TEXEL_MISSING)
     statistics = {"local_retraced": len(again), "rem_texels": int((found != TEXEL_SKY).sum())}
@@ -552,15 +552,17 @@ def blend_local_map(
     if settings.rem_missing == "shade":
         missing = missing[mesh.triangle.reshape(-1)[missing] >= 0]
         statistics["rem_shaded"] = len(missing)
-        for face in np.unique(missing // (n * n)):
-            own = missing[missing // (n * n) == face]
-            _shade_texels(scene, local, inverse, own, int(face), settings)
+        if len(missing):
+            shade_texels(scene, local, missing, settings)
         found[missing] = TEXEL_SHADED
         state = wp.array(found, dtype=wp.uint8, device=device)
     return local, state, statistics
 
 
-def _shade_texels(scene: Scene, local: CubeMaps, inverse: wp.array, texels: np.ndarray, face: int, settings) -> None:
+def shade_texels(
+    scene: Scene, local: CubeMaps, texels: np.ndarray, settings: Settings, onward: Onward | None = None
+) -> None:
+    """Shade texels (flat indices) where they lie: at their distances, on their triangles; mirrors show what `onward` has."""
     device, count, n = scene.device, len(texels), local.resolution
     texel = wp.array(texels.astype(np.int32), dtype=int, device=device)
     point, direction = (wp.empty(count, dtype=wp.vec3, device=device) for _ in range(2))
@@ -568,10 +570,12 @@ def _shade_texels(scene: Scene, local: CubeMaps, inverse: wp.array, texels: np.n
     triangle = wp.empty(count, dtype=int, device=device)
     centre, axes = local.centres[0], local.axes[0]
     eye = wp.vec3(*(centre - scene.origin))
-    inputs = [scene.view, eye, n, texel, inverse, local.view.triangle, point, direction, triangle, u, v]
-    launch.launch(missing_hits_kernel, count, inputs, device, settings.threads)
-    camera = face_camera(scene, centre, axes, face, n)
+    inputs = [scene.view, eye, n, texel, local.view.distance, local.view.triangle, point, direction, triangle, u, v]
+    launch.launch(shaded_hits_kernel, count, inputs, device, settings.threads)
+    camera = face_camera(scene, centre, axes, 0, n)  # of any face: it tells the size of a texel
     gbuffer = GBuffer(camera, camera.view(scene), triangle, u)
     layer = hits_layer(point, direction, triangle, u, v)
     radiance = shade.seen_radiance(scene, gbuffer, layer, settings.threads, asked_shadows(scene, settings))
+    if onward is not None:
+        onward(gbuffer, layer, radiance)
     launch.launch(put_radiance_kernel, count, [texel, radiance, local.view.radiance], device, settings.threads)

@@ -2,7 +2,7 @@
 
 Authored: prims with `WarpReflectEnvironmentMapAPI`, drawn, or read from the files that `bake` wrote. Placed: candidates along
 the paths of the mirrors, chosen one after the other by what each would take off the predicted error. A map holds what is
-there at any time: parts that move are left out of it, and so is the mirror that it stands in.
+there at any time: parts that move are left out of it with their shadows, and so is the mirror that it stands in.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ BURIED_SHARE = 0.5  # of what rays from a place meet: so many closed bodies from
 LEAST_GAIN = 0.02  # of the error: a map that takes off less is not placed
 COINCIDENT = 1.0e-6  # of the scene's size: places nearer than this are told
 KEY, PLACES_KEY = "reference maps", "places of reference maps"
-BYTES_FULL, BYTES_PACKED, BYTES_PALETTE = 24, 4, 8192
+BYTES_FULL, BYTES_PACKED, BYTES_PALETTE = 20, 4, 8192
 
 
 @dataclass(frozen=True)
@@ -122,9 +122,11 @@ def _buried(scene: Scene, centre: np.ndarray, settings: Settings) -> bool:
 
 
 def take_over(earlier: Scene, scene: Scene) -> None:
-    """Hand reference maps to the same stage's scene at another time: they hold nothing that moves."""
+    """Hand reference maps, and the structure for rays, to the same stage's scene at another time: nothing in them moves."""
     if earlier is scene or not same_lights(earlier, scene) or _still_prims(earlier) != _still_prims(scene):
         return
+    if _numbering(earlier) == _numbering(scene):
+        scene.keep_still_tracer(earlier)
     for key, known in earlier.environments.items():
         if key[0] == KEY and key not in scene.environments:
             maps = known.maps.at(scene)
@@ -181,16 +183,31 @@ def place_maps(scene: Scene, settings: Settings) -> Placement:
             break
         chosen.append(next_)
         best = np.minimum(errors[next_], best)
-    unseen = float(1.0 - seen[chosen].any(axis=0).mean()) if seen.shape[1] else 0.0
     centres = positions[candidates[chosen]]
-    error = float(best.mean() / texel) if len(best) else 0.0
+    error, unseen = _judged(errors[chosen], seen[chosen], texel)
     return Placement(("",) * len(chosen), centres, np.tile(np.eye(3), (len(chosen), 1, 1)), error, unseen)
+
+
+def predicted_error(scene: Scene, centres: np.ndarray, settings: Settings) -> tuple[float, float]:
+    """What maps at some places (world, [n, 3]) are worth: see `Placement.error_px` and `Placement.unseen`."""
+    positions, owners = _paths(scene, settings)
+    if not len(positions) or not len(centres):
+        return 0.0, 0.0
+    judged, texel = _spread(positions, POSITIONS_MAX), 2.0 / settings.environment_resolution
+    return _judged(*_errors(scene, positions[judged], owners[judged], centres, texel, settings.threads), texel)
+
+
+def _judged(errors: np.ndarray, seen: np.ndarray, texel: float) -> tuple[float, float]:
+    """Mean of the best errors of all points in texels, and the share of the points that nothing sees."""
+    if not errors.shape[1]:
+        return 0.0, 0.0
+    return float(errors.min(axis=0).mean() / texel), float(1.0 - seen.any(axis=0).mean())
 
 
 def draw_maps(scene: Scene, placement: Placement, settings: Settings) -> CubeMaps:
     """The maps of some places, all texels in full."""
     return render_maps(
-        scene,
+        scene.with_still_rays(),
         placement.centres,
         settings.environment_resolution,
         axes=placement.axes,
@@ -246,8 +263,8 @@ def _make(scene: Scene, settings: Settings) -> ReferenceMaps:
                 f"{100 * placement.unseen:.0f} % of what is reflected is seen by none",
             )
         )
-    if settings.rem_texels == "packed":
-        maps = pack_maps(maps)
+    # At another time the numbers of triangles are others: they are not kept.
+    maps = pack_maps(maps) if settings.rem_texels == "packed" else maps.at(scene)
     return ReferenceMaps(maps, placement, tuple(notes), reach)
 
 
@@ -345,6 +362,10 @@ def _key(settings: Settings) -> tuple:
     names = ("environment_resolution", "rem_texels", "rem_limit", "rem_error_px", "shadows")
     names += ("dome_shadows", "shadow_samples", "reflector_max_roughness", "reflector_min_weight")
     return (KEY, *(getattr(settings, name) for name in names))
+
+
+def _numbering(scene: Scene) -> list[tuple[int, int]]:
+    return [(part.first_triangle, part.triangle_count) for part in scene.parts]
 
 
 def _still_prims(scene: Scene) -> list[tuple]:
