@@ -221,6 +221,17 @@ def test_frames_pass_their_pace_on(ball_room):
     assert second.plan.pace != 1.0 and second.plan.settings == first.plan.settings
 
 
+def test_a_mirror_that_changes_its_technique_prepares_anew(ball_room):
+    plan = planned(ball_room, budget_ms=50.0)
+    dear = planned(ball_room, budget_ms=50.0, costs=dataclasses.replace(BUILT_IN, trace=1e3))
+    assert plan.rows[0].technique == "raytraced" != dear.rows[0].technique
+    wr.render_frame(ball_room, plan)
+    assert plan._prepared
+    made = keep_pace(dataclasses.replace(plan, _fronts=dear._fronts), plan, 1e3, plan.predicted["ms"])
+    assert made.rows[0].technique != "raytraced" and not made._prepared
+    wr.render_frame(ball_room, made)
+
+
 # What it came out as.
 
 

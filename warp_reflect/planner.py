@@ -261,14 +261,15 @@ def keep_pace(plan: Plan, before: Plan, spent_ms: float, expected_ms: float) -> 
     if within:
         if before.scene is plan.scene and before.camera is plan.camera:
             return before
-        made = dataclasses.replace(plan, rows=list(plan.rows), notes=[], _prepared=dict(plan._prepared))
+        made = dataclasses.replace(plan, rows=list(plan.rows), notes=[], _prepared={})
         _fit(made, before.pace, keep=before)
     else:
-        made = dataclasses.replace(plan, rows=list(plan.rows), notes=[], _prepared=dict(plan._prepared))
+        made = dataclasses.replace(plan, rows=list(plan.rows), notes=[], _prepared={})
         _fit(made, before.pace * ratio**PACE_WEIGHT)
         if made.predicted["ms"] > ROOM * budget and spent_ms < budget:
             _fit(made, made.pace, keep=before)
-    _take_over(made, before)
+    for earlier in (plan, before):
+        _take_over(made, earlier)
     return made
 
 
