@@ -304,12 +304,8 @@ def make_plan(
         raise ValueError(f"unknown method '{method}'; nearest: {', '.join(near or [*METHODS, *TECHNIQUES])}")
     view = find_camera(scene, camera, size)
     notes: list[Note] = []
-    asked = method != "none"
-    found = [
-        (k, part, weight)
-        for k, part in enumerate(scene.parts)
-        if asked and (weight := mirror_weight(scene, part, settings))
-    ]
+    weights = _weights(scene, settings) if method != "none" else {}
+    found = [(k, part, weight) for k, part in enumerate(scene.parts) if (weight := weights.get(part.material, 0.0))]
     clear = [k for k, part in enumerate(scene.parts) if transmission.is_transparent(scene, part)]
     pixels, tried = _look(scene, view, [k for k, _, _ in found], clear, settings)
     lights = plan_lights(scene, tried, settings, costs)
@@ -337,15 +333,21 @@ def make_plan(
 
 def _too_rough(scene: Scene, settings: Settings) -> list[Note]:
     """A note for each material that would be a mirror if it were smoother."""
-    smooth = settings.replace(reflector_max_roughness=1.0)
+    smooth, now = _weights(scene, settings.replace(reflector_max_roughness=1.0)), _weights(scene, settings)
     notes = []
     for part in scene.parts:
-        if mirror_weight(scene, part, smooth) and not mirror_weight(scene, part, settings):
+        if smooth[part.material] and not now[part.material]:
             material = scene.data.materials[part.material]
             text = f"roughness {mirror_roughness(material):.3g} > {settings.reflector_max_roughness:g}"
             text += " (reflector_max_roughness): no mirror; what it reflects is scattered"
             notes.append(Note(material.path or part.prim_path, text))
     return list(dict.fromkeys(notes))
+
+
+def _weights(scene: Scene, settings: Settings) -> dict[int, float]:
+    """`mirror_weight` of every material in use."""
+    one_of = {part.material: part for part in scene.parts}
+    return {material: mirror_weight(scene, part, settings) for material, part in one_of.items()}
 
 
 def prefer_forward(plan: Plan, earlier: Plan | None = None) -> Plan:

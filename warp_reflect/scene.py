@@ -325,6 +325,7 @@ class Scene:
         self._seen: dict[int, np.ndarray] = {}  # material -> which triangles a mirror of it may show
         self.fits: dict = {}  # part -> the quadric nearest to it, found by the technique that asks
         self.segmentations: dict = {}  # part -> its sheets (`segments.Segmentation`), likewise
+        self.facts: dict = {}  # (what, which part) -> what a technique found out about its shape: plans ask again and again
         self.environments: dict = {}  # environment maps that several mirrors share, by what they were drawn with
         self._pyramids: dict = {}
         if any(material.textures for material in data.materials):

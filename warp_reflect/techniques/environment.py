@@ -190,8 +190,10 @@ def _preview(scene: Scene, reflector, camera: Camera, threads: int):
     shrink = max(1.0, max(camera.size) / PREVIEW_SIDE)
     size = tuple(max(1, round(side / shrink)) for side in camera.size)
     scaled = {name: getattr(camera, name) / shrink for name in ("fx", "fy", "cx", "cy")}
-    small = dataclasses.replace(camera, size=size, **scaled)
-    gbuffer = raster.draw_scene(scene, small, threads)
+    of, gbuffer = scene.facts.get(("preview", None), (None, None))
+    if of is not camera:  # else it was drawn for another mirror of the same plan
+        gbuffer = raster.draw_scene(scene, dataclasses.replace(camera, size=size, **scaled), threads)
+        scene.facts["preview", None] = camera, gbuffer
     found, _ = surface.mirror_pixels(scene, gbuffer, {reflector.id: reflector.part}, threads)
     pixels = found[reflector.id]
     point, ray = (array.numpy().astype(np.float64) for array in (pixels.point, pixels.direction))

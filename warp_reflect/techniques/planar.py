@@ -98,8 +98,7 @@ def applies(
     flat, reason = is_flat(scene, part)
     if camera is None or flat:
         return flat, reason
-    plane = _plane(scene, part)
-    height, sine = _deviation(scene, part, *plane)
+    plane, height, sine = _flatness(scene, part)
     points = scene.host_points[np.unique(_corners(scene, part))].astype(np.float64)
     nearest = float(np.linalg.norm(points - (camera.eye - scene.origin), axis=1).min())
     # A plane moved by h moves its picture by 2 h, a normal turned by an angle turns the ray by twice that.
@@ -112,7 +111,7 @@ def applies(
 
 def is_flat(scene: Scene, part: PartRange) -> tuple[bool, str]:
     """Whether a part is a plane to rounding, and the reason."""
-    height, sine = _deviation(scene, part, *_plane(scene, part))
+    _, height, sine = _flatness(scene, part)
     flat = f"{height:.1e} of its size off its plane (at most {FLATNESS_MAX:.0e})"
     bent = f"normals off the plane's by a sine of {sine:.1e} (at most {NORMAL_SINE_MAX:.0e})"
     if height > FLATNESS_MAX:
@@ -123,8 +122,7 @@ def is_flat(scene: Scene, part: PartRange) -> tuple[bool, str]:
 def prepare(scene: Scene, reflector: Reflector, settings: Settings) -> Prepared:
     """The plane through the mirror's points."""
     part = scene.parts[reflector.part]
-    plane = _plane(scene, part)
-    height, sine = _deviation(scene, part, *plane)
+    plane, height, sine = _flatness(scene, part)
     exact = height <= FLATNESS_MAX and sine <= NORMAL_SINE_MAX
     # A plane never sees itself, closed or not.
     return Prepared(replace(reflector, convex=True), plane_frame(*plane), exact=exact)
@@ -181,6 +179,15 @@ def reflect(
 
 def _corners(scene: Scene, part: PartRange) -> np.ndarray:
     return scene.host_triangles[part.first_triangle : part.first_triangle + part.triangle_count]
+
+
+def _flatness(scene: Scene, part: PartRange):
+    """(plane, height, sine) of a part: `_plane` and `_deviation`, kept with the scene."""
+    key = "plane", part.first_triangle
+    if key not in scene.facts:
+        plane = _plane(scene, part)
+        scene.facts[key] = plane, *_deviation(scene, part, *plane)
+    return scene.facts[key]
 
 
 def _plane(scene: Scene, part: PartRange) -> tuple[np.ndarray, np.ndarray, float]:

@@ -161,7 +161,11 @@ def scene_segments(scene: Scene, part: int) -> Segmentation:
 
 
 def _one_map(scene: Scene, part: int) -> bool:
-    return scene.body(part).convex and _sharpest(*part_mesh(scene, scene.parts[part])) <= EDGE_SINE_MAX
+    known = scene.facts.get(("one map", part))
+    if known is None:
+        known = scene.body(part).convex and _sharpest(*part_mesh(scene, scene.parts[part])) <= EDGE_SINE_MAX
+        scene.facts["one map", part] = known
+    return known
 
 
 def _sharpest(points: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> float:
