@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 from scene_parts import checked_sheet
-from scene_sets import BALLOONS, WALLS, boxes, corner, play_room, play_things, studio
+from scene_sets import BALLOONS, WALLS, arena, boxes, corner, play_room, play_things, studio
 from scene_shapes import block, dome, patch, revolve, sheet, spherical_cap, torus
 from scene_writer import MIRROR_DIGITS, Recipe, Writer
 
@@ -270,7 +270,32 @@ def _car_body(w: Writer) -> None:
     w.room_lights(3.8, 0.3)
 
 
+def _facing_mirrors(w: Writer) -> None:
+    """Two flat mirrors that face each other, a sphere and toys between them: a row of images that never ends."""
+    arena(w, 6.0, 24)
+    for name, z, turn in (("Near", 2.6, -90), ("Far", -2.6, 90)):
+        pane = sheet((-1.7, 0, 1.3), (3.4, 0, 0), (0, 0, -2.6), w.detail.count(1), w.detail.count(1))
+        mirror = w.mesh(f"/World/{name}", pane, "Chrome", digits=MIRROR_DIGITS)
+        w.transform(mirror, (0, 1.4, z), (turn, 0, 0))
+    w.sphere("/World/Sphere", (-0.75, 0.45, -0.6), 0.4, "Chrome")
+    boxes(
+        w,
+        (0.55, -0.9, 0.4, 0.9, 20, "Red"),
+        (0.95, 0.6, 0.35, 0.35, 50, "Orange"),
+        (-0.4, 0.9, 0.3, 0.3, 10, "Green"),
+        (0.1, -1.7, 0.3, 1.3, 35, "SkyBlue"),
+    )
+    w.camera((0.42, 1.35, 2.3), (-0.05, 0.95, -2.6), 46)
+    w.lights()
+
+
 CURVED_SCENES = {
+    "facing_mirrors": Recipe(
+        _facing_mirrors,
+        "Two flat mirrors that face each other, with a sphere between them",
+        ("/World/Far", "/World/Near", "/World/Sphere"),
+        techniques=("planar", "quadric", "reflector_map", "raytraced"),
+    ),
     "toy_room": Recipe(
         _toy_room,
         "Sphere, ellipsoid, cylinder, cone and paraboloid among toys; after Lages Miguel et al. 2014, figure 4",

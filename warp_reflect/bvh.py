@@ -438,6 +438,34 @@ def trace_onward_kernel(
     out_status[i] = wp.uint8(hit.status)
 
 
+@wp.kernel
+def trace_bounced_kernel(
+    first: int,
+    mesh_id: wp.uint64,
+    scene: SceneView,
+    facet: wp.array(dtype=int),
+    point: wp.array(dtype=wp.vec3),
+    normal: wp.array(dtype=wp.vec3),
+    direction: wp.array(dtype=wp.vec3),
+    bodies: wp.array(dtype=OwnBody),
+    # Outputs:
+    out_triangle: wp.array(dtype=int),
+    out_u: wp.array(dtype=float),
+    out_v: wp.array(dtype=float),
+    out_distance: wp.array(dtype=float),
+    out_status: wp.array(dtype=wp.uint8),
+):
+    """One thread per ray."""
+    i = first + wp.tid()
+    body = bodies[scene.triangle_patch[facet[i]]]
+    hit = trace_ray(mesh_id, scene, point[i], direction[i], normal[i], facet[i], body, 1)
+    out_triangle[i] = hit.triangle
+    out_u[i] = hit.u
+    out_v[i] = hit.v
+    out_distance[i] = hit.t
+    out_status[i] = wp.uint8(hit.status)
+
+
 class Tracer:
     """Owner of the triangle BVH of a scene, of one of its parts alone, or of those triangles that a mirror may show.
 
@@ -581,6 +609,24 @@ def trace_transmitted(
     inputs = [wp.uint64(scene.tracer.id), scene.view, facet, pixels.point, pixels.normal, pixels.direction, inside]
     outputs = [layer.triangle, layer.u, layer.v, layer.distance, layer.status]
     launch.launch(trace_onward_kernel, pixels.count, inputs + outputs, scene.device, threads, split_min=TRACE_SPLIT_MIN)
+
+
+def trace_bounced(scene: Scene, layer: ReflectionLayer, facet: wp.array, bodies: wp.array, threads: int = 0) -> None:
+    """Follow rays that mirrors of any bodies reflect and write their hits into the layer.
+
+    Args:
+        scene: Its BVH is built if this is the first use.
+        layer: Its pixels' points, directions and normals on the rays' side; receives triangle, u, v, distance and status.
+        facet: int32 [n], the triangle that each ray starts on.
+        bodies: `OwnBody` of every patch.
+        threads: CPU threads; 0: one per core.
+    """
+    pixels = layer.pixels
+    inputs = [wp.uint64(scene.tracer.id), scene.view, facet, pixels.point, pixels.normal, pixels.direction, bodies]
+    outputs = [layer.triangle, layer.u, layer.v, layer.distance, layer.status]
+    launch.launch(
+        trace_bounced_kernel, pixels.count, inputs + outputs, scene.device, threads, split_min=TRACE_SPLIT_MIN
+    )
 
 
 def own_obstacles(scene: Scene, gbuffer: GBuffer, pixels: MirrorPixels, part: int, threads: int = 0) -> wp.array:

@@ -74,6 +74,27 @@ def finish_effects(
     }
 
 
+def bounce_effect(visible: bool, alone: bool, mirrored: float | None, settings: Settings) -> Effect:
+    """Whether what a mirror shows of mirrors is followed on.
+
+    Args:
+        visible: Whether the plan's camera sees it.
+        alone: Whether it is the only mirror, and convex.
+        mirrored: Share of the points tried in it that show a mirror; None: none was tried.
+        settings: The plan's.
+    """
+    if settings.bounces < 2:
+        return Effect(False, f"bounces={settings.bounces}: a mirror seen in a mirror shows its base and the dome")
+    if not visible:
+        return Effect(False, "not seen from the camera")
+    if alone:
+        return Effect(False, "the only mirror, and convex: it shows none")
+    if not mirrored:
+        return Effect(False, "no point of it that was tried shows a mirror", {"share": 0.0})
+    reason = f"{100.0 * mirrored:.2g}% of its points show a mirror, up to {settings.bounces} reflections (bounces)"
+    return Effect(True, reason, {"share": mirrored, "bounces": settings.bounces})
+
+
 def pane_effects(
     scene: Scene, part: PartRange, interface: str, reason: str, pixels: int, settings: Settings, camera: Camera
 ) -> dict[str, Effect]:

@@ -10,10 +10,10 @@ from functools import cached_property
 import numpy as np
 import warp as wp
 
-from warp_reflect import __version__, images, motion, raster, shade, surface, transmission, waves
+from warp_reflect import __version__, bounces, images, motion, raster, shade, surface, transmission, waves
 from warp_reflect.channels import CHANNELS, POINTS, component_of, known_names, reflection_channels
 from warp_reflect.effects import FINISHES, PANE_FINISHES, finish_of, moves_with_time
-from warp_reflect.layers import Camera, GBuffer, MirrorPixels, ReflectionLayer, add_statistics
+from warp_reflect.layers import NO_REFLECTOR, Camera, GBuffer, MirrorPixels, ReflectionLayer, add_statistics
 from warp_reflect.planner import Plan, PlanRow, find_camera, keep_pace
 from warp_reflect.scene import Scene
 from warp_reflect.settings import Technique
@@ -244,13 +244,13 @@ def render_frame(scene: Scene, plan: Plan, camera: str | Camera | None = None, p
     else:
         interfaces = _interfaces(scene, plan)
         with timer("shade"):
-            shown = _shown(scene, plan, gbuffer, interfaces)
+            shown, met = _shown(scene, plan, gbuffer, interfaces)
             finish = _finish(scene, plan)
             picture = shade.shade(scene, gbuffer, layers, settings.threads, plan.shadows, finish, shown)
         transmitted = {}
         if interfaces is not None:
             with timer("transmission"):
-                transmitted = _look_through(scene, plan, transmission.Through(shown, interfaces, plan.shadows), picture)
+                transmitted = _look_through(scene, plan, transmission.Through(shown, interfaces, met), picture)
     timings = timer.ms
     for id in layers.keys() - kept:
         for step, ms in layers[id].timings.items():
@@ -308,8 +308,10 @@ def _interfaces(scene: Scene, plan: Plan) -> transmission.Interfaces | None:
     return transmission.make_interfaces(scene, finishes)
 
 
-def _shown(scene: Scene, plan: Plan, gbuffer: GBuffer, interfaces: transmission.Interfaces | None) -> shade.Shown:
-    """What the eye sees, with the waves on it, and how what it sees is looked through."""
+def _shown(
+    scene: Scene, plan: Plan, gbuffer: GBuffer, interfaces: transmission.Interfaces | None
+) -> tuple[shade.Shown, transmission.Met]:
+    """What the eye sees, with the waves on it; how rays see mirrors and, in the former alone, through surfaces."""
     threads = plan.settings.threads
     shown = shade.look(scene, gbuffer, threads, plan.shadows)
     surfaces = [*((row.reflector.part, row) for row in plan.rows), *((pane.part, pane) for pane in plan.panes)]
@@ -318,18 +320,42 @@ def _shown(scene: Scene, plan: Plan, gbuffer: GBuffer, interfaces: transmission.
         asked = {k: finish_of(scene.data.materials[scene.parts[k].material], each) for k, each in wavy.items()}
         normals = waves.wave_normals(scene, gbuffer, shown.normals, asked, threads)
         shown = dataclasses.replace(shown, normals=normals)
+    met = _met(scene, plan, shown, interfaces)
     if interfaces is None:
-        return shown
-
-    direct = shown.seen
+        return dataclasses.replace(shown, seen=met), met
 
     def seen(layer: ReflectionLayer) -> wp.array:
-        radiance = direct(layer)
+        radiance = met(layer)
         if layer.radiance is not None:
             return radiance
-        return transmission.behind(scene, gbuffer, interfaces, layer, radiance, plan.settings, plan.shadows)
+        return transmission.behind(scene, gbuffer, interfaces, layer, radiance, plan.settings, met)
 
-    return dataclasses.replace(shown, seen=seen)
+    return dataclasses.replace(shown, seen=seen), met
+
+
+def _met(scene: Scene, plan: Plan, shown: shade.Shown, interfaces: transmission.Interfaces | None) -> transmission.Met:
+    """The radiance of what a layer's rays meet, with what the mirrors among that reflect where the plan asks for it."""
+    settings, plain = plan.settings, shown.seen
+    left = {row.reflector.id: settings.bounces - 1 for row in plan.rows if row.effects["second_bounce"].on}
+    if plan.panes and plan.rows:
+        left[NO_REFLECTOR] = settings.bounces
+    if not left:
+        return plain
+    bodies = bounces.mirror_bodies(scene, [row.reflector for row in plan.rows])
+
+    def reflected(layer: ReflectionLayer) -> wp.array:
+        radiance = plain(layer)
+        if interfaces is None:
+            return radiance
+        return transmission.behind(scene, shown.gbuffer, interfaces, layer, radiance, settings, plain)
+
+    def met(layer: ReflectionLayer) -> wp.array:
+        radiance, follow = plain(layer), left.get(layer.pixels.reflector, 0)
+        if layer.radiance is not None or not follow:
+            return radiance
+        return bounces.onward(scene, shown.gbuffer, bodies, layer, radiance, reflected, follow, settings.threads)
+
+    return met
 
 
 def _look_through(

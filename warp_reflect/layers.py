@@ -186,12 +186,15 @@ class GBuffer:
     reflector_id: wp.array | None = None
 
 
+NO_REFLECTOR = 0  # id of rays that no mirror has reflected
+
+
 @dataclass
 class MirrorPixels:
     """The pixels at which one reflector is seen, compacted, with the surface every technique reflects at.
 
     Attributes:
-        reflector: 1-based id.
+        reflector: 1-based id; `NO_REFLECTOR` behind a pane.
         pixel: int32 [n], ascending.
         point: vec3 [n], scene frame: P on the mirror.
         normal: vec3 [n], unit, on the eye's side.

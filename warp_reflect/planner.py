@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from warp_reflect import __version__, applicable, calibration, choice, raster, transmission, vector
 from warp_reflect.applicable import PREFERRED
 from warp_reflect.budget import BUILT_IN, Costs, fixed_ms, predict
-from warp_reflect.effects import Effect, finish_effects, pane_effects
+from warp_reflect.effects import Effect, bounce_effect, finish_effects, pane_effects
 from warp_reflect.launch import thread_count
 from warp_reflect.layers import Camera, Reflector
 from warp_reflect.lighting import LightRow, needs_probe, plan_lights, shadows_of
@@ -313,9 +313,15 @@ def make_plan(
     cast = shadows_of(lights, settings)
     drawn = settings.replace(shadows=cast is not None and cast.direct)
     rows = [
-        _row(scene, view, drawn, method, number, part_index, part, weight, pixels[part_index], notes, costs, lights)
+        _row(scene, view, drawn, method, number, part_index, part, weight, pixels[part_index], notes, costs)
         for number, (part_index, part, weight) in enumerate(found, 1)
     ]
+    alone = len(rows) == 1 and rows[0].reflector.convex
+    for row in rows:
+        visible = row.pixels > 0
+        mirrored = None if tried is None else tried.mirrored.get(row.reflector.part)
+        row.effects["second_bounce"] = bounce_effect(visible, alone, mirrored, settings)
+        row.effects["shadows"] = _shadows(lights, visible)
     panes = [_pane(scene, view, settings, k, pixels[k]) for k in clear]
     bumpy = [scene.data.materials[part.material] for _, part, _ in found]
     for path in dict.fromkeys(material.path for material in bumpy if "normal" in material.textures):
@@ -435,16 +441,18 @@ def find_camera(scene: Scene, camera: str | Camera | None, size: tuple[int, int]
 def _look(
     scene: Scene, camera: Camera, mirrors: list[int], panes: list[int], settings: Settings
 ) -> tuple[dict[int, int], Probe | None]:
-    """(pixels that show each part, the points that lights are decided by or None where there is nothing to decide)."""
-    wanted = needs_probe(scene, settings)
-    if not scene.triangle_count or not (mirrors or panes or wanted):
+    """(pixels that show each part; the points that lights and bounces are decided by, None where nothing is decided)."""
+    casting = needs_probe(scene, settings)
+    if not scene.triangle_count or not (mirrors or panes or casting):
         return dict.fromkeys([*mirrors, *panes], 0), None
     small = preview(scene, camera, settings.threads)
-    tried = probe(scene, small, mirrors, settings.threads) if wanted else None
-    return small.pixels_of(scene, [*mirrors, *panes]), tried
+    pixels = small.pixels_of(scene, [*mirrors, *panes])
+    seen = [k for k in mirrors if pixels[k] >= max(settings.few_pixels, 1)]
+    facing = settings.bounces > 1 and (len(mirrors) > 1 or any(not scene.body(k).convex for k in seen))
+    return pixels, probe(scene, small, mirrors, settings.threads) if casting or facing else None
 
 
-def _row(scene, camera, settings, method, number, part_index, part, weight, pixels, notes, costs, lights) -> PlanRow:
+def _row(scene, camera, settings, method, number, part_index, part, weight, pixels, notes, costs) -> PlanRow:
     looked_at = method != "auto" or pixels >= max(settings.few_pixels, 1)
     reflector = Reflector(number, part_index, looked_at and scene.body(part_index).convex)
     technique, forced, reason = _technique(scene, reflector, camera, method, pixels, settings, part, notes, costs)
@@ -462,7 +470,7 @@ def _row(scene, camera, settings, method, number, part_index, part, weight, pixe
         forced,
         reason,
         pixels,
-        _effects(scene, part, technique, pixels, weight, settings) | {"shadows": _shadows(lights, pixels > 0)},
+        _effects(scene, part, technique, pixels, weight, settings),
         settings,
         _predicted(scene, reflector, camera, technique, pixels, settings, costs),
     )
@@ -641,7 +649,6 @@ def _effects(scene, part, technique, pixels, weight, settings) -> dict[str, Effe
         "warm_start": Effect(
             visible and searched, "from the previous frame where one is given" if searched else no_search
         ),
-        "second_bounce": Effect(False, "a mirror seen in a mirror shows its base and the dome, one level deep"),
         **finish_effects(scene, part, visible, settings, technique),
     }
 

@@ -139,7 +139,7 @@ class Settings:
     """Neighbour triangles a refinement may walk over before the BVH decides."""
     complexity: str = "low"
     """`low`, `medium`, `high`, `veryhigh`: subdivision level 0-3, and the tessellation of gprims, as in usdrecord."""
-    bounces: int = 1
+    bounces: int = 2
     """Mirrors seen in mirrors, in mirrors ...: how many reflections are followed; beyond them a mirror shows the dome."""
     transparency_depth: int = 8
     """Transparent surfaces behind one another that are looked through; nothing is seen through the next."""
@@ -220,7 +220,7 @@ class Settings:
         _require(0 <= self.iterations <= 1000, "iterations", self.iterations, "0 to 1000")
         _require(0.0 <= self.tolerance < 1.0, "tolerance", self.tolerance, "0 to 1 (a sine)")
         _require(8 <= self.map_resolution <= 2048, "map_resolution", self.map_resolution, "8 to 2048 nodes")
-        _require(1 <= self.bounces <= 8, "bounces", self.bounces, "1 to 8")
+        _require(1 <= self.bounces <= 64, "bounces", self.bounces, "1 to 64")
         texels = self.environment_resolution
         _require(4 <= texels <= 4096, "environment_resolution", texels, "4 to 4096 texels")
         update = self.environment_update

@@ -19,7 +19,7 @@ it by: e^(-distance / length) in place of linear fog, so that two distances in a
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +27,7 @@ import warp as wp
 
 from warp_reflect import bvh, launch, shade
 from warp_reflect.layers import (
+    NO_REFLECTOR,
     CameraView,
     GBuffer,
     MirrorPixels,
@@ -38,7 +39,6 @@ from warp_reflect.normal_maps import prepare_normals
 from warp_reflect.optics import PI, dielectric_reflectance, refract, tangent_basis
 from warp_reflect.scene import SHAPE_NONE, FinishData, PartRange, Scene, SceneView
 from warp_reflect.settings import Settings, Technique
-from warp_reflect.shadows import Shadows
 from warp_reflect.shapes import facet_normal, unit
 from warp_reflect.surface import hit_normal, polish, shown_normal, surface_at
 from warp_reflect.textures import Look, plain_look, prepare_looks
@@ -52,6 +52,9 @@ KINDS = ("opaque", "thin", "solid")
 # Share of the light below which what is behind is not looked for: half a step of an 8 bit picture.
 LEAST_WEIGHT = wp.constant(2.0e-3)
 GOLDEN_ANGLE = wp.constant(2.399963229728653)
+
+
+Met = Callable[[ReflectionLayer], wp.array]
 
 
 @wp.struct
@@ -83,12 +86,12 @@ class Through:
     Attributes:
         shown: What the eye sees.
         interfaces: Of the scene.
-        shadows: Which lights cast shadows; None: none.
+        met: Radiance, vec3 [n], of what a layer's rays meet, without what is behind that.
     """
 
     shown: shade.Shown
     interfaces: Interfaces
-    shadows: Shadows | None = None
+    met: Met
 
 
 @dataclass
@@ -487,7 +490,7 @@ def look_through(
     point, normal, direction, weight = vectors
     facet, inside = wp.empty(n, dtype=int, device=device), wp.empty(n, dtype=wp.uint8, device=device)
     box = pixel_bounds(pixel, gbuffer.camera.size[0])
-    pixels = MirrorPixels(0, wp.array(pixel, dtype=int, device=device), point, normal, direction, box)
+    pixels = MirrorPixels(NO_REFLECTOR, wp.array(pixel, dtype=int, device=device), point, normal, direction, box)
     inputs = [scene.view, gbuffer.view, interfaces.views, shown.looks, shown.normals, gbuffer.triangle]
     inputs += [gbuffer.depth_key, gbuffer.reflector_id, pixels.pixel, *sample, int(wavy)]
     launch.launch(cross_seen_kernel, n, [*inputs, facet, *vectors[:3], inside, weight], device, threads)
@@ -499,12 +502,12 @@ def look_through(
 def through_radiance(scene: Scene, through: Through, found: Transmission, settings: Settings) -> wp.array:
     """What a transparent surface's pixels see through it, vec3 [n], before its weight; sets `found.nearness`."""
     gbuffer, interfaces = through.shown.gbuffer, through.interfaces
-    seen = shade.seen_radiance(scene, gbuffer, found.layer, settings.threads, through.shadows)
+    seen = through.met(found.layer)
     patches = None
     if interfaces.fades:
         triangle = gbuffer.triangle.numpy()[found.layer.pixels.pixel.numpy()]
         patches = wp.array(scene.host_triangle_patch[triangle], dtype=int, device=scene.device)
-    asked = [interfaces, found.layer, seen, settings, through.shadows, patches, found.nearness]
+    asked = [interfaces, found.layer, seen, settings, through.met, patches, found.nearness]
     return behind(scene, gbuffer, *asked)
 
 
@@ -515,7 +518,7 @@ def behind(
     layer: ReflectionLayer,
     seen: wp.array,
     settings: Settings,
-    shadows: Shadows | None = None,
+    met: Met,
     patches: wp.array | None = None,
     nearness: wp.array | None = None,
 ) -> wp.array:
@@ -528,7 +531,7 @@ def behind(
         layer: Rays and what they met.
         seen: vec3 [n], radiance of that; not written to.
         settings: `transparency_depth`, threads.
-        shadows: Which lights cast shadows; None: none.
+        met: Radiance, vec3 [n], of what other rays meet, without what is behind that.
         patches: int32 [n], patch that each ray has come through, which fades what is behind it; None: none.
         nearness: float [n], gets the mean of 1 / length of the way to what is seen in the end; None: not asked for.
 
@@ -561,8 +564,8 @@ def behind(
         numbers = wp.array(index, dtype=int, device=device)
         if near is not None:
             before, way = way, wp.empty(n, dtype=float, device=device)
-            met = [numbers, layer.triangle, layer.distance, own, carried, before, way, near]
-            launch.launch(nearness_kernel, n, met, device, threads)
+            ways = [numbers, layer.triangle, layer.distance, own, carried, before, way, near]
+            launch.launch(nearness_kernel, n, ways, device, threads)
         if total is None:
             if not len(going) and not (interfaces.fades and patches is not None):
                 total = seen
@@ -590,7 +593,7 @@ def behind(
         facet, inside = taken(layer.triangle), taken(inside)
         layer = ReflectionLayer.empty(pixels, Technique.RAYTRACED, device)
         bvh.trace_transmitted(scene, layer, facet, inside, threads)
-        seen = shade.seen_radiance(scene, gbuffer, layer, threads, shadows)
+        seen = met(layer)
     if near is not None:
         launch.launch(mean_nearness_kernel, count, [near, nearness], device, threads)
     return total

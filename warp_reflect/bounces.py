@@ -1,0 +1,179 @@
+"""Mirrors seen in mirrors: reflected rays are followed from what a mirror shows, as far as `bounces` says.
+
+What a mirror shows of another one, or of itself, is shaded with the domes alone where that reflects (`shade.hit_radiance`).
+Here the ray is reflected there once more, on the analytic surface where there is one, and what it meets takes the domes'
+place; between facing mirrors so often as is asked for, and then the domes stand. A rough mirror seen in a mirror is sharp.
+
+Source: the recursion of Whitted, An Improved Illumination Model for Shaded Display, CACM 1980. Differs from it by: the first
+reflection is any technique's, and only reflectors are followed, what is merely glossy shows the domes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+import numpy as np
+import warp as wp
+
+from warp_reflect import bvh, launch, shade
+from warp_reflect.layers import GBuffer, MirrorPixels, ReflectionLayer, Reflector
+from warp_reflect.normal_maps import prepare_normals
+from warp_reflect.scene import SHAPE_NONE, Scene, SceneView
+from warp_reflect.settings import Technique
+from warp_reflect.shade import LightView
+from warp_reflect.surface import hit_normal, polish, shown_normal
+from warp_reflect.textures import Look, plain_look, prepare_looks
+
+wp.set_module_options({"enable_backward": False})
+
+# Share of the light below which a reflection is not followed: half a step of an 8 bit picture.
+LEAST_WEIGHT = wp.constant(2.0e-3)
+
+
+def mirror_bodies(scene: Scene, reflectors: Iterable[Reflector]) -> wp.array:
+    """`bvh.OwnBody` of every patch of a scene, without triangles where it is no reflector's."""
+    bodies = [bvh.OwnBody() for _ in scene.patch_shapes]
+    for reflector in reflectors:
+        for patch in scene.parts[reflector.part].patches:
+            bodies[patch] = bvh.body_of(scene, reflector.part, reflector.convex)
+    return wp.array(bodies, dtype=bvh.OwnBody, device=scene.device)
+
+
+@wp.kernel
+def reflect_hits_kernel(
+    first: int,
+    scene: SceneView,
+    lights: LightView,
+    bodies: wp.array(dtype=bvh.OwnBody),
+    looks: wp.array(dtype=Look),
+    normals: wp.array(dtype=wp.vec3),
+    # Rays and what they met:
+    triangle: wp.array(dtype=int),
+    u: wp.array(dtype=float),
+    v: wp.array(dtype=float),
+    direction: wp.array(dtype=wp.vec3),
+    weight: wp.array(dtype=wp.vec3),
+    # Outputs:
+    out_point: wp.array(dtype=wp.vec3),
+    out_normal: wp.array(dtype=wp.vec3),
+    out_direction: wp.array(dtype=wp.vec3),
+    out_weight: wp.array(dtype=wp.vec3),
+    out_domes: wp.array(dtype=wp.vec3),
+):
+    """One thread per ray: its reflection at the mirror that it met, and what the domes gave there; weight 0 where none is."""
+    i = first + wp.tid()
+    tri = triangle[i]
+    if tri < 0:
+        return
+    patch = scene.triangle_patch[tri]
+    if bodies[patch].triangle_count == 0:
+        return
+    d = direction[i]
+    look = Look()
+    if looks.shape[0] > 0:
+        look = looks[i]
+    else:
+        look = plain_look(scene, tri, u[i], v[i])
+    # As `shade.hit_radiance` has it, whose domes are taken back.
+    n = shown_normal(normals, i, hit_normal(scene, tri, u[i], v[i]))
+    cosine = wp.dot(n, d)
+    lobes = shade.split_lobes(look, wp.vec3(0.0, 0.0, 0.0), wp.abs(cosine), False)
+    carried = wp.cw_mul(weight[i], lobes.mirror)
+    if wp.max(carried) < LEAST_WEIGHT:
+        return
+    onward = d - 2.0 * cosine * n
+    out_domes[i] = wp.cw_mul(carried, shade.dome_radiance(lights, onward))
+    corner = scene.triangles[tri]
+    p = (1.0 - u[i] - v[i]) * scene.points[corner[0]] + u[i] * scene.points[corner[1]] + v[i] * scene.points[corner[2]]
+    if scene.patches[patch].shape != SHAPE_NONE and normals.shape[0] == 0:
+        polished = polish(scene, tri, p, d)
+        if polished[0] != 0.0 or polished[1] != 0.0 or polished[2] != 0.0:
+            n = wp.vec3(polished[0], polished[1], polished[2])
+            p += polished[3] * d
+            onward = d - 2.0 * wp.dot(n, d) * n
+    if wp.dot(n, d) > 0.0:
+        n = -n
+    out_point[i] = p
+    out_normal[i] = n
+    out_direction[i] = wp.normalize(onward)
+    out_weight[i] = carried
+
+
+@wp.kernel
+def add_bounce_kernel(
+    first: int,
+    index: wp.array(dtype=int),
+    weight: wp.array(dtype=wp.vec3),
+    domes: wp.array(dtype=wp.vec3),
+    seen: wp.array(dtype=wp.vec3),
+    out_total: wp.array(dtype=wp.vec3),
+):
+    """One thread per ray; each adds to the total of its own pixel."""
+    i = first + wp.tid()
+    k = index[i]
+    changed = out_total[k] + wp.cw_mul(weight[i], seen[i]) - domes[i]
+    # Domes that were added in another order leave a rounding of theirs.
+    out_total[k] = wp.vec3(wp.max(changed[0], 0.0), wp.max(changed[1], 0.0), wp.max(changed[2], 0.0))
+
+
+def onward(
+    scene: Scene,
+    gbuffer: GBuffer,
+    bodies: wp.array,
+    layer: ReflectionLayer,
+    seen: wp.array,
+    met: Callable[[ReflectionLayer], wp.array],
+    bounces: int,
+    threads: int = 0,
+) -> wp.array:
+    """What a layer's rays see, with what the mirrors among it reflect.
+
+    Args:
+        scene: On the G-buffer's device; its BVH is built if this is the first use.
+        gbuffer: What the eye sees.
+        bodies: From `mirror_bodies`.
+        layer: Rays and what they met.
+        seen: vec3 [n], radiance of that, mirrors showing the domes; not written to.
+        met: The same of other rays.
+        bounces: Reflections that are followed from there on.
+        threads: CPU threads; 0: one per core.
+
+    Returns:
+        vec3 [n]; `seen` itself where no mirror is met. The layer's statistics get `bounced`: rays followed, and
+        `bounce_limit`: those whose mirror shows the domes as `bounces` ended there.
+    """
+    device = scene.device
+    index = np.arange(layer.pixels.count, dtype=np.int32)
+    weight = wp.full(layer.pixels.count, wp.vec3(1.0, 1.0, 1.0), dtype=wp.vec3, device=device)
+    first, total = layer, seen
+    for depth in range(bounces + 1):
+        n = layer.pixels.count
+        looks = prepare_looks(scene, gbuffer, layer, threads)
+        normals = prepare_normals(scene, gbuffer, layer, threads)
+        point, normal, direction, carried, domes = (wp.zeros(n, dtype=wp.vec3, device=device) for _ in range(5))
+        inputs = [scene.view, scene.lights, bodies, looks, normals, layer.triangle, layer.u, layer.v]
+        inputs += [layer.pixels.direction, weight, point, normal, direction, carried, domes]
+        launch.launch(reflect_hits_kernel, n, inputs, device, threads)
+        going = np.flatnonzero(carried.numpy().max(axis=1) > 0.0)
+        if not len(going):
+            break
+        if depth == bounces:
+            _count(first, bounce_limit=len(going))
+            break
+        _count(first, bounced=len(going))
+        if total is seen:
+            total = wp.clone(seen)
+        taken = lambda array: wp.array(array.numpy()[going], dtype=array.dtype, device=device)  # noqa: B023, E731
+        index, weight, domes, facet = index[going], taken(carried), taken(domes), taken(layer.triangle)
+        pixel, box = taken(layer.pixels.pixel), layer.pixels.box
+        pixels = MirrorPixels(layer.pixels.reflector, pixel, taken(point), taken(normal), taken(direction), box)
+        layer = ReflectionLayer.empty(pixels, Technique.RAYTRACED, device)
+        bvh.trace_bounced(scene, layer, facet, bodies, threads)
+        numbers = wp.array(index, dtype=int, device=device)
+        launch.launch(add_bounce_kernel, len(going), [numbers, weight, domes, met(layer), total], device, threads)
+    return total
+
+
+def _count(layer: ReflectionLayer, **numbers: int) -> None:
+    for name, value in numbers.items():
+        layer.statistics[name] = layer.statistics.get(name, 0) + value
