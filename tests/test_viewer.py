@@ -428,6 +428,45 @@ def test_picked_cube_stands_around_the_ball(searching):
     assert np.abs(point - CENTRE).max() == pytest.approx(RADIUS, rel=0.02)
 
 
+@pytest.fixture(scope="module")
+def mapped(ball_room):
+    """An inspector of local maps, with their overlay and the field's on."""
+    settings = wr.Settings(environment_resolution=32, mesh_cells=8, field_kind="heightfield", field_cell=0.1)
+    session = Session(ball_room, size=SIZE, method="layered_environment", settings=settings)
+    made = inspector.Inspector(session, off_screen=True, window_size=WINDOW)
+    press(made, "m", "h")
+    yield made
+    made.plotter.close()
+
+
+def test_picked_cell_of_a_local_map_lies_where_its_nodes_do(mapped):
+    mesh = mapped.meshes["local map /mirror"]
+    floor = np.abs(mesh.cell_centers().points[:, 1] + mapped.session.scene.origin[1] + 1.0) < 1e-4
+    wanted = np.flatnonzero(floor & (mesh.cell_data["size"] == 4))[0]
+    centre = mesh.get_cell(wanted).points.mean(axis=0) + mapped.session.scene.origin
+    point, cell, drawn = picked(mapped, "local map", centre)
+    assert point[1] == pytest.approx(-1.0, abs=0.01) and np.linalg.norm(point - centre) < 0.2
+    assert drawn.cell_data["size"][cell] >= 1 and drawn.cell_data["rgb"][cell].max() > 0
+
+
+def test_picked_reference_map_stands_at_its_eye(mapped):
+    wanted = mapped.meshes["reference maps"].points[0] + mapped.session.scene.origin
+    point, _, drawn = picked(mapped, "reference maps", wanted)
+    assert np.linalg.norm(point - wanted) < 0.05 and drawn.point_data["map"][0] == 0
+
+
+def test_picked_roof_of_the_field_has_its_height(mapped):
+    mesh = mapped.meshes["field"]
+    highest = mesh.cell_data["height"].argmax()
+    wanted = mesh.get_cell(highest).points.mean(axis=0) + mapped.session.scene.origin
+    renderer = mapped.plotter.renderers[inspector.SPACE]
+    renderer.camera.position = tuple(wanted - mapped.session.scene.origin + [0.5, 4.0, 0.5])  # from above
+    renderer.camera.focal_point = tuple(wanted - mapped.session.scene.origin)
+    point, cell, drawn = picked(mapped, "field", wanted, tolerance=1e-6)
+    assert np.linalg.norm(point - wanted) < 0.05
+    assert drawn.cell_data["height"][cell] == pytest.approx(point[1] + 1.0, abs=1e-3)  # above the floor
+
+
 def test_plot_shows_the_present_point_and_the_sweep(window, monkeypatch):
     every = session_module.quick_contenders
     monkeypatch.setattr(session_module, "quick_contenders", lambda session: islice(every(session), 5))

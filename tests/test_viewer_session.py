@@ -574,6 +574,54 @@ def test_search_of_a_plane_or_a_traced_mirror_has_no_field(plane_room):
     assert not [name for name in found if name.startswith(("bisector", "search", "cube", "grid"))]
 
 
+def balls_of(scene):
+    """Centres [n, 3] and radius of the balls of a room, without the mirror."""
+    placed = [each.world_from_object for each in scene.data.instances if each.prim_path.startswith("/ball")]
+    return np.array([matrix[:3, 3] for matrix in placed]), 0.3
+
+
+def test_nodes_of_a_local_map_lie_on_what_it_sees(ball_room):
+    settings = wr.Settings(environment_resolution=32, mesh_cells=8, rem_count=2)
+    plan = wr.make_plan(ball_room, size=SIZE, method="layered_environment", settings=settings)
+    found = geometry.meshes(plan)
+    mesh, (prepared,) = found["local map /mirror"], [plan.prepared(row) for row in plan.rows]
+    at = mesh.points + ball_room.origin
+    centres, radius = balls_of(ball_room)
+    from_balls = np.abs(np.linalg.norm(at[:, None] - centres, axis=2) - radius).min(axis=1)
+    on_floor = np.abs(at[:, 1] + 1.0) < 1e-4
+    assert on_floor.any() and (~on_floor).sum() > 20
+    assert (from_balls[~on_floor] < 0.01 * radius).all()  # facets of 24 x 48
+    assert np.allclose(np.linalg.norm(at - prepared.centre, axis=1), mesh.point_data["distance"], rtol=1e-5)
+    # Fine where depths part, coarse on the floor; together the cells cover the faces once.
+    size = mesh.cell_data["size"]
+    assert size.min() == 1 and size.max() == 4
+    face, y, x, side = prepared.cells.T
+    area = (np.minimum(x + side, 31) - x) * (np.minimum(y + side, 31) - y)
+    assert (np.bincount(face, area) == 31 * 31).all()
+    places = found["reference maps"]
+    assert np.allclose(places.points + ball_room.origin, prepared.references.placement.centres, atol=1e-5)
+    assert places.point_data["mirrors"].sum() == min(
+        2, len(places.points)
+    ) and "local map /mirror" not in geometry.meshes(wr.make_plan(ball_room, size=SIZE, method="environment"))
+
+
+@pytest.mark.parametrize("kind", ["heightfield", "occupancy"])
+def test_roofs_of_a_field_are_those_of_the_scene(ball_room, kind):
+    plan = wr.make_plan(ball_room, size=SIZE, settings=wr.Settings(field_kind=kind, field_cell=0.1))
+    assert "field" not in geometry.meshes(plan)
+    mesh = geometry.meshes(plan, field=True)["field"]
+    at = mesh.cell_centers().points + ball_room.origin
+    centres, radius = balls_of(ball_room)
+    apart = np.linalg.norm(at[:, None, ::2] - centres[:, ::2], axis=2)
+    open_floor = (apart > radius + 0.15).all(axis=1)
+    assert open_floor.sum() > 1000 and np.allclose(at[open_floor, 1], -1.0, atol=1e-4)
+    for centre in centres:
+        near = np.linalg.norm(at[:, ::2] - centre[::2], axis=1) < 0.5 * radius
+        top = at[near, 1].max()
+        assert top >= centre[1] + 0.95 * radius  # at the middle of a column, or another ball that stands higher
+    assert at[:, 1].max() <= (centres[:, 1] + radius).max() + 0.101
+
+
 def test_virtual_objects_of_a_mirror_together_are_the_same(ball_room):
     plan = wr.make_plan(ball_room, size=SIZE, method="quadric")
     apart = geometry.meshes(plan)

@@ -46,6 +46,7 @@ class Prepared:
 
     Attributes:
         state: Of its texels, see `local_map.blend_local_map`.
+        cells: Of its depths' adaptive mesh, see `local_map.DepthMesh`.
         movers: Parts that move and that it may show.
     """
 
@@ -54,6 +55,7 @@ class Prepared:
     references: ReferenceMaps
     local: CubeMaps
     state: wp.array
+    cells: np.ndarray
     movers: tuple[int, ...] = ()
     statistics: dict = field(default_factory=dict)
     timings: dict = field(default_factory=dict)
@@ -122,7 +124,7 @@ def prepare(scene: Scene, reflector, settings: Settings) -> Prepared:
     beyond = _beyond(scene, part, references.placement.centres, references.reach)
     scene.notes += [note for note in beyond if note not in scene.notes]
     timings = {name: 1e3 * seconds for name, seconds in timings.items()}
-    return Prepared(part, centre, references, local, state, movers, mesh.statistics | statistics, timings)
+    return Prepared(part, centre, references, local, state, mesh.cells, movers, mesh.statistics | statistics, timings)
 
 
 def intersect_still(scene: Scene, part: int, centre: np.ndarray, threads: int) -> local_map.Intersect:

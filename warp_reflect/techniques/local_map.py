@@ -83,6 +83,7 @@ class DepthMesh:
         inverse: Inverse depth along the face's axis, 0 sky, float32 [6, n, n].
         triangle: Of the ray, or of the nearest node's; -1 sky or unknown, int32 [6, n, n].
         traced: Whether it has a ray of its own, bool [6, n, n].
+        cells: Of the mesh, (face, y, x, size in texels), int32 [m, 4]: its nodes are their corners.
         statistics: `local_rays`, `local_discontinuities` (neighbouring texels at depths apart by more than the ratio),
             `local_discontinuities_traced` (those of which both have rays of their own).
     """
@@ -90,6 +91,7 @@ class DepthMesh:
     inverse: np.ndarray
     triangle: np.ndarray
     traced: np.ndarray
+    cells: np.ndarray = field(default_factory=lambda: np.zeros((0, 4), np.int32))
     statistics: dict = field(default_factory=dict)
 
     @classmethod
@@ -173,11 +175,11 @@ def trace_depth_mesh(
     """
     n = resolution
     mesh = DepthMesh.empty(n)
-    leaves = np.zeros((0, 4), np.int32)
     if ratio <= 0.0 or n < 3:
         mesh.trace(np.arange(FACE_COUNT * n * n), intersect)
     else:
-        leaves = _refine(mesh, intersect, cells, ratio)
+        mesh.cells = _refine(mesh, intersect, cells, ratio)
+    leaves = mesh.cells[mesh.cells[:, 3] > 1]  # the others have no texels but their corners
     arrays = [wp.array(mesh.inverse.reshape(-1), dtype=float, device=device)]
     arrays += [wp.array(mesh.triangle.reshape(-1), dtype=int, device=device)]
     known = wp.array(mesh.traced.reshape(-1).astype(np.uint8), dtype=wp.uint8, device=device)
@@ -189,7 +191,7 @@ def trace_depth_mesh(
 
 
 def _refine(mesh: DepthMesh, intersect: Intersect, cells: int, ratio: float) -> np.ndarray:
-    """Trace the nodes of the mesh; the cells that stay, (face, y, x, size), int [n, 4]."""
+    """Trace the nodes of the mesh; the cells that stay, (face, y, x, size), int32 [n, 4]."""
     n = mesh.inverse.shape[1]
     radial = np.zeros(FACE_COUNT * n * n, np.float32)
     size = 1
@@ -208,6 +210,7 @@ def _refine(mesh: DepthMesh, intersect: Intersect, cells: int, ratio: float) -> 
         if len(asked):
             radial[asked] = mesh.trace(asked, intersect)
         if size == 1:
+            done.append(np.column_stack([grid, np.ones(len(grid), np.int64)]))
             break
         a, b, c, d = radial[corners]
         most, least = np.maximum(np.maximum(a, b), np.maximum(c, d)), np.minimum(np.minimum(a, b), np.minimum(c, d))
@@ -218,7 +221,7 @@ def _refine(mesh: DepthMesh, intersect: Intersect, cells: int, ratio: float) -> 
         steps = np.array([[0, 0, 0], [0, 0, size], [0, size, 0], [0, size, size]])
         grid = (grid[split][:, None] + steps).reshape(-1, 3)
         grid = grid[(grid[:, 1] < n - 1) & (grid[:, 2] < n - 1)]
-    return np.concatenate(done) if done else np.zeros((0, 4), np.int32)
+    return np.concatenate(done).astype(np.int32)
 
 
 def _discontinuities(mesh: DepthMesh, ratio: float) -> dict[str, int]:

@@ -13,9 +13,11 @@ from warp_reflect.images import srgb_from_linear
 from warp_reflect.layers import Camera, ReflectionLayer
 from warp_reflect.planner import Plan, PlanRow, prefer_forward
 from warp_reflect.scene import Scene
+from warp_reflect.scene_field import make_field
 from warp_reflect.settings import Status, Technique
 from warp_reflect.techniques.forward import History
 from warp_reflect.timing import StageTimer
+from warp_reflect.viewer.maps import field_mesh, local_mesh, reference_mesh
 from warp_reflect.viewer.method import grid_mesh, search_meshes
 from warp_reflect.viewer.session import Pick
 from warp_reflect.virtual_objects import VirtualObject, virtual_objects
@@ -36,7 +38,13 @@ class Region(IntEnum):
 
 
 def meshes(
-    plan: Plan, frame: Frame | None = None, picks: Sequence[Pick] = (), *, apart: bool = True, searches: bool = True
+    plan: Plan,
+    frame: Frame | None = None,
+    picks: Sequence[Pick] = (),
+    *,
+    apart: bool = True,
+    searches: bool = True,
+    field: bool = False,
 ) -> dict[str, pv.PolyData]:
     """A planned view as meshes.
 
@@ -48,6 +56,7 @@ def meshes(
         frame: Of that plan; its camera is the eye. None: the plan's camera.
         picks: From `Session.pick`.
         searches: With the field and the path of a search; their kernels take some seconds to compile the first time.
+        field: With the field that rays of maps are traced through; making it takes some tenths of a second.
         apart: A mesh for each virtual object; else `virtual PATH`, all of a mirror's as one, which is much faster.
 
     Returns:
@@ -64,6 +73,10 @@ def meshes(
         field PATH` on the mirror and `bisector field on the cube PATH` on the map's cube around it, the sink of whose
         vectors (points: `bisector`, `residual`) is the reflection point; `cube PATH`; `search path PATH` and `search path
         on the cube PATH`, the places the search takes (points: `residual`, `evaluations`);
+        where local maps are blended from reference maps, `reference maps`, their places (points: `map`, `mirrors` that blend
+        it), and `local map PATH`, its adaptive mesh on what it sees (cells: `rgb`, `size`, `face`, `torn`
+        by a silhouette; points: `distance`);
+        `field`: roofs of the field's columns, or what is solid in its cells (cells: `height`);
         `rays`: of the picks, eye to mirror to reflected point, and on to the virtual point; cells: `virtual`, `pick`.
     """
     camera = plan.camera if frame is None else frame.camera
@@ -71,7 +84,7 @@ def meshes(
     forward = prefer_forward(plan)
     _, layers = reflect_scene(scene, forward, camera, StageTimer(scene.device))
     found = {"scene": _scene_mesh(scene, forward, layers, camera)}
-    names = _names(plan)
+    names = names_of(plan)
     colors = _colors(scene)
     for row in plan.rows:
         found["mirror " + names[row.reflector.id]] = _mirror_mesh(scene, row, colors)
@@ -98,6 +111,9 @@ def meshes(
             found["grid " + name] = grid_mesh(layer.cells)
         if searches and layer.method == Technique.REFLECTOR_MAP:
             found |= _search_meshes(forward, row, layer, camera, picks, name)
+    found |= _map_meshes(forward, layers, names)
+    if field:
+        found |= field_meshes_of(plan)
     if picks:
         found["rays"] = ray_mesh(scene, picks)
     for mesh in found.values():
@@ -107,13 +123,35 @@ def meshes(
 
 def search_meshes_of(plan: Plan, frame: Frame, picks: Sequence[Pick]) -> dict[str, pv.PolyData]:
     """Of `meshes` those of searches alone, for a frame's own mirrors."""
-    names, found = _names(plan), {}
+    names, found = names_of(plan), {}
     for row in plan.rows:
         layer = frame.layers.get(row.reflector.id)
         if layer is not None and layer.method == Technique.REFLECTOR_MAP:
             found |= _search_meshes(plan, row, layer, frame.camera, picks, names[row.reflector.id])
     for mesh in found.values():
         mesh.field_data["origin"] = plan.scene.origin
+    return found
+
+
+def field_meshes_of(plan: Plan) -> dict[str, pv.PolyData]:
+    """Of `meshes` the field of a plan's scene without its mirrors; empty where nothing is left."""
+    field = make_field(plan.scene, plan.settings, without=[row.reflector.part for row in plan.rows])
+    if field is None:
+        return {}
+    mesh = field_mesh(field)
+    mesh.field_data["origin"] = plan.scene.origin
+    return {"field": mesh}
+
+
+def _map_meshes(plan: Plan, layers: dict[int, ReflectionLayer], names: dict[int, str]) -> dict[str, pv.PolyData]:
+    drawn = [row for row in plan.rows if row.reflector.id in layers]
+    blended = [row for row in drawn if layers[row.reflector.id].method == Technique.LAYERED_ENVIRONMENT]
+    if not blended:
+        return {}
+    prepared = [(plan.prepared(row), row.settings) for row in blended]
+    found = {"reference maps": reference_mesh(plan.scene, prepared)}
+    for row, (each, settings) in zip(blended, prepared, strict=True):
+        found["local map " + names[row.reflector.id]] = local_mesh(plan.scene, each, settings.depth_ratio)
     return found
 
 
@@ -151,7 +189,7 @@ def ray_mesh(scene: Scene, picks: Sequence[Pick]) -> pv.PolyData:
     return mesh
 
 
-def _names(plan: Plan) -> dict[int, str]:
+def names_of(plan: Plan) -> dict[int, str]:
     """Reflector id to a name that no other has."""
     return {
         row.reflector.id: row.path
@@ -188,7 +226,7 @@ def _scene_mesh(scene: Scene, plan: Plan, layers: dict[int, ReflectionLayer], ca
     prims = np.array([part.prim for part in scene.parts], np.int32)
     mesh.cell_data["rgb"] = _colors(scene)[part_of[kept]]
     mesh.cell_data["prim"] = prims[part_of[kept]]
-    names, region = _names(plan), None
+    names, region = names_of(plan), None
     for row in sorted(plan.rows, key=lambda row: row.pixels):
         region = _regions(scene, row, layers.get(row.reflector.id), camera)
         mesh.point_data["region " + names[row.reflector.id]] = region

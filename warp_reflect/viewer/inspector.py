@@ -36,9 +36,12 @@ WIPE_SLACK = 8  # pixels beside the wipe's line at which it is gripped
 ZOOM_STEP = 1.15  # of the distance, for a notch of the wheel
 EVENT_PRIORITY = 10.0  # before the interactor style, whose priority is 0
 SPACE_BACK = tuple(c / 255.0 for c in panes.BACK)
-RAY_COLOR, VIRTUAL_COLOR, EYE_COLOR = "#ffb03a", "#e23cbe", "#6cc4ff"
+RAY_COLOR, VIRTUAL_COLOR, EYE_COLOR, MESH_COLOR = "#ffb03a", "#e23cbe", "#6cc4ff", "#20242c"
 REGION_COLORS = ["#5a5f6a", "#4fae62", "#c2503f", "#5a7fc0"]  # by `geometry.Region`
 USE_COLORS = ["#5a5f6a", "#4fae62", "#c2503f", "#ff9a3a"]  # by `grid.CellUse`
+NEARER = (
+    0.003  # by which a local map's mesh is drawn nearer to its centre than what it lies on, which would shine through
+)
 ARROW_SHARE = 0.6  # of a node's distance to the next, about
 RESIDUAL_SHOWN = 1.0  # tangent of the angle at the far end of the arrows' colours
 SPACE_SIDE = (0.30, 0.22, 0.10)  # where the 3-D view stands beside the eye: right, up, back, of the pivot's distance
@@ -84,8 +87,8 @@ class Inspector:
         session: The scene under inspection.
         plotter: The pyvista plotter.
         wipe: Share of the frame's width from where the reference is shown; 1: none of it.
-        whole_plan, shows_regions, shows_virtual, shows_grid, shows_search, shows_tradeoff: What the keys p, g, v, i, b and t
-            switch.
+        whole_plan, shows_regions, shows_virtual, shows_grid, shows_search, shows_maps, shows_field, shows_tradeoff: What the
+            keys p, g, v, i, b, m, h and t switch.
         knobs_first: The first knob shown, where there are more than there is room for.
         meshes: What the 3-D pane shows, see `geometry.meshes`.
         stepwise: Leave measuring and the 3-D pane to the timer, so that a window answers between them.
@@ -95,6 +98,7 @@ class Inspector:
         self.session = session
         self.wipe = 0.75
         self.whole_plan = self.shows_regions = self.shows_grid = self.shows_search = False
+        self.shows_maps = self.shows_field = False
         self.shows_virtual = True
         self.shows_tradeoff = bool(session.tradeoff.marks)
         self.knobs_first = 0
@@ -157,7 +161,12 @@ class Inspector:
     def _show_space(self) -> None:
         session = self.session
         self.meshes = geometry.meshes(
-            session.plan, session.frame, session.picks, apart=False, searches=self.shows_search
+            session.plan,
+            session.frame,
+            session.picks,
+            apart=False,
+            searches=self.shows_search,
+            field=self.shows_field,
         )
         self._fill_space()
         self.draw()
@@ -246,7 +255,7 @@ class Inspector:
         self._add("mirror", _together(groups["mirror"]), color="#c8d4e4", opacity=0.35, **common)
         virtual = _together(groups["virtual"]) if self.shows_virtual else None
         self._add("virtual", virtual, scalars="rgb", rgb=True, ambient=0.5, diffuse=0.5, **common)
-        covered = self.shows_search or self.shows_grid
+        covered = self.shows_search or self.shows_grid or self.shows_maps or self.shows_field
         points = None if covered else _together(groups["reflection points"])
         if points is not None:
             points = pv.PolyData(points.points[:: -(-points.n_points // POINTS_SHOWN)])
@@ -255,6 +264,7 @@ class Inspector:
         look = {"scalars": "use", "cmap": USE_COLORS, "clim": (-0.5, 3.5), "line_width": 1, "lighting": False}
         self._add("grid", _merged(grids), **look, **common)
         self._fill_search(common)
+        self._fill_maps(common)
         self._add("eye", self._eye_lines(), color=EYE_COLOR, line_width=2, lighting=False, **common)
         rays = self.meshes.get("rays")
         real = virtual = None
@@ -275,6 +285,12 @@ class Inspector:
             words = "3-D: grid: interpolated green, hidden red, solved one by one orange"
             if not grids:
                 words = "3-D: no interpolation grid: grid share and grid error are off, or no map is searched"
+        elif self.shows_maps:
+            words = "3-D: reference maps, and each local map's adaptive mesh"
+            if "reference maps" not in self.meshes:
+                words = "3-D: no mirror here has a local map (method = layered_environment)"
+        elif self.shows_field:
+            words = "3-D: the field that rays of maps are traced through"
         self._title(words)
         self.plotter.renderers[SPACE].ResetCameraClippingRange()
 
@@ -300,6 +316,28 @@ class Inspector:
         ends = [pv.PolyData(mesh.points) for mesh in lines]
         self._add("search places", _merged(ends), color=VIRTUAL_COLOR, point_size=8, lighting=False, **common)
         self._add("cube", _merged(cubes), style="wireframe", color="#7a8090", lighting=False, **common)
+
+    def _fill_maps(self, common: dict) -> None:
+        references = self.meshes.get("reference maps") if self.shows_maps else None
+        self._add("reference maps", references, color=RAY_COLOR, point_size=14, render_points_as_spheres=True, **common)
+        # Of the mirror that was picked last, else of the one with most pixels; several lie over one another.
+        local = self.meshes.get("local map " + self._told_mirror()) if self.shows_maps else None
+        if local is not None and local.n_cells:
+            centre = local.field_data["centre"]
+            local = local.extract_cells(np.flatnonzero(local.cell_data["torn"] == 0))
+            local.points += NEARER * (centre - local.points)
+        look = {"scalars": "rgb", "rgb": True, "show_edges": True, "edge_color": MESH_COLOR, "lighting": False}
+        self._add("local map", local, **look, **common)
+        field = self.meshes.get("field") if self.shows_field else None
+        self._add("field", field, scalars="height", cmap="viridis", opacity=0.7, **common)
+
+    def _told_mirror(self) -> str:
+        plan = self.session.plan
+        names = geometry.names_of(plan)
+        picked = [pick.reflector for pick in self.session.picks if pick.reflector]
+        own = [row for row in plan.rows if picked and row.path == picked[-1]]
+        row = max(own or plan.rows, key=lambda row: row.pixels, default=None)
+        return "" if row is None else names[row.reflector.id]
 
     def _add(self, name: str, mesh: pv.DataSet | None, **look) -> None:
         if mesh is None or not mesh.n_points:
@@ -549,6 +587,12 @@ class Inspector:
         elif code == "b":
             self.shows_search = not self.shows_search
             self._update_search()
+        elif code == "m":
+            self.shows_maps = not self.shows_maps
+        elif code == "h":
+            self.shows_field = not self.shows_field
+            if self.shows_field and "field" not in self.meshes:
+                self.meshes |= geometry.field_meshes_of(self.session.plan)
         elif code == "t":
             self.shows_tradeoff = not self.shows_tradeoff
             self.draw(REFERENCE)
@@ -558,7 +602,7 @@ class Inspector:
             self.session.picks.clear()
             self.meshes.pop("rays", None)
             self._update_search()
-        if code in ("g", "v", "i", "b", "c"):
+        if code in ("g", "v", "i", "b", "m", "h", "c"):
             self._fill_space()
             self.draw()
         return code not in ("q", "e")

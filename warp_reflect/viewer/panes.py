@@ -50,8 +50,8 @@ TRACK = (0.36, 0.70)  # of the pane's width, where a knob's track begins and end
 KEYS = (
     "drag: orbit   shift-drag: pan   wheel: zoom, or more settings   click: pick",
     "g: regions   v: virtual objects   i: interpolation grid   b: bisector field   c: forget picks",
-    "p: plan   t: accuracy against time   s: sweep this view",
-    ": name=value sets any setting   q: quit",
+    "m: reference and local maps   h: heightfield   p: plan   t: accuracy against time",
+    "s: sweep this view   : name=value sets any setting   q: quit",
 )
 
 

@@ -84,6 +84,8 @@ class Control:
 
 # Positions that say more than the generic ones; these knobs come first.
 POSITIONS = {
+    "budget_ms": (0.0, 2.0, 4.0, 8.0, 16.0, 33.0, 66.0, 100.0, 200.0),
+    "max_error_px": (0.0, 0.1, 0.25, 0.5, 1.0, 2.0, 4.0),
     "grid_share": (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0),
     "grid_error_px": (0.0, 0.1, 0.25, 0.5, 1.0, 2.0, 4.0),
     "iterations": (0, 1, 2, 3, 4, 6, 9, 12, 16, 24),
@@ -91,15 +93,31 @@ POSITIONS = {
     "reuse_px": (0.0, 0.1, 0.25, 0.5, 1.0, 2.0),
     "refine": (),
     "search": (),
+    "glossy": (),
+    "glossy_samples": (0, 4, 8, 16, 32, 64, 128, 256),
+    "rem_count": (1, 2, 3, 4, 6, 8),
     "tolerance": (0.0, 1.0e-6, 1.0e-5, 1.0e-4, 1.0e-3, 1.0e-2, 0.1),
 }
 LABELS = {
+    "budget_ms": "budget (ms)",
+    "max_error_px": "error (px)",
+    "glossy": "rough mirrors",
+    "glossy_samples": "rays of rough",
+    "rem_count": "reference maps",
     "grid_share": "grid share",
     "grid_error_px": "grid error (px)",
     "map_resolution": "map resolution",
     "reuse_px": "reuse (px)",
 }
-ZERO_WORDS = {"grid_share": "off", "grid_error_px": "off", "iterations": "default", "reuse_px": "off"}
+ZERO_WORDS = {
+    "budget_ms": "none",
+    "max_error_px": "none",
+    "glossy_samples": "automatic",
+    "grid_share": "off",
+    "grid_error_px": "off",
+    "iterations": "default",
+    "reuse_px": "off",
+}
 AT_LOADING = ("complexity", "reflector_max_roughness", "reflector_min_weight")  # nothing of a loaded stage follows them
 FACTORS = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0)  # of a setting's default
 FROM_ZERO = (0, 1, 2, 4, 8, 16, 32, 64)  # of a setting that is 0 by default
@@ -126,8 +144,9 @@ def _positions(name: str, default) -> tuple:
         try:
             Settings().replace(**{name: "?"})
         except ValueError as refusal:  # it says what is possible
-            _, said, words = str(refusal).partition("expected one of ")
-            return tuple(words.split(", ")) if said else (default,)
+            said = str(refusal).partition("expected ")[2].removeprefix("one of ")
+            words = tuple(word for word in re.split(r", | or ", said) if word.isidentifier())
+            return words if default in words else (default,)
         return (default,)
     if not isinstance(default, int | float):
         return (default,)
