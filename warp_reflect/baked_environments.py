@@ -18,6 +18,7 @@ from warp_reflect.scene import EnvironmentMapData
 LAYOUT = "radiance_cube_1"  # ends in the version of how maps are drawn and stored; others are not read
 LAYOUT_HEADER = "warp_reflect:layout"
 PLACE_HEADER = "warp_reflect:place"
+WORLD_HEADER = "warp_reflect:world"  # digest of what it was drawn from
 FACES = 6
 EDGE_MIN, EDGE_MAX = 4, 4096  # texels, as `Settings.environment_resolution`
 PLACE_ROUNDING = 1.0e-6  # of a coordinate: a place that is off by more has been moved since
@@ -48,12 +49,16 @@ def write_map(
     images.write_exr(path, channels, attributes=header | dict(attributes or {}))
 
 
-def read_map(asked: EnvironmentMapData) -> tuple[np.ndarray, np.ndarray]:
+def read_map(asked: EnvironmentMapData, world: str) -> tuple[np.ndarray, np.ndarray]:
     """(radiance float32 [6, n, n, 4], distance float32 [6, n, n]) of the file of a place.
+
+    Args:
+        asked: The place.
+        world: Digest of what it would be drawn from now.
 
     Raises:
         OSError: no such file, or not whole.
-        ValueError: it holds something else, or was drawn at another place; one line.
+        ValueError: it holds something else, or was drawn at another place or of another world; one line.
     """
     channels, header = images.read_exr(asked.map_file)
     layout = header.get(LAYOUT_HEADER)
@@ -75,4 +80,6 @@ def read_map(asked: EnvironmentMapData) -> tuple[np.ndarray, np.ndarray]:
     size = np.abs(asked.world_from_map).max()
     if np.abs(place - asked.world_from_map).max() > PLACE_ROUNDING * size:
         raise ValueError(f"{asked.map_file}: was drawn at another place; bake it again")
+    if header.get(WORLD_HEADER) != world:
+        raise ValueError(f"{asked.map_file}: was drawn of another world; bake it again")
     return radiance.reshape(FACES, n, n, 4), distance.reshape(FACES, n, n)

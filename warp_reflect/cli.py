@@ -333,7 +333,7 @@ def bake(
     opened: StageOptions | None = None,
     mirrors: MirrorOptions | None = None,
 ) -> int:
-    """Draw the reflector maps of all mirrors once: an EXR each, and a layer over the stage that renders with them.
+    """Draw all mirrors' reflector maps, and environment maps, once: an EXR each, and a layer over the stage to render with.
 
     Args:
         stage: A USD file; it is not changed.
@@ -352,9 +352,9 @@ def bake(
     written = []
     with reporting(None) as report:
 
-        def wrote(prim_path: str, file, resolution: int) -> None:
+        def wrote(prim_path: str, file, size: str) -> None:
             written.append(str(file))
-            print(f"{file}: {prim_path}, {resolution} nodes along an edge", flush=True)
+            print(f"{file}: {prim_path}, {size}", flush=True)
 
         try:
             report.busy("reading " + stage)
@@ -370,7 +370,10 @@ def bake(
             report.line(f"kept {len(written)} finished: {', '.join(written)}")
             return PART_WAY
         report.notes([*scene.notes, *baked.notes])
-    print(f"{baked.layer}: {len(baked.files)} mirror{'s' * (len(baked.files) != 1)} baked, over {stage}")
+    done = f"{len(baked.files)} mirror{'s' * (len(baked.files) != 1)} baked"
+    if baked.environments:
+        done += f", {len(baked.environments)} environment map{'s' * (len(baked.environments) != 1)}"
+    print(f"{baked.layer}: {done}, over {stage}")
     return DONE
 
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
-from warp_reflect.scene import Scene
+from warp_reflect.scene import Note, Scene, SceneData
 
 
 def load_stage(
@@ -48,8 +49,19 @@ def load_stage(
     reader = None if untrusted else StageReader(*arguments)
 
     def at(code: float | None, known: Scene | None = None) -> Scene:
-        data = read_untrusted(path, code, *arguments[1:]) if reader is None else reader.read(code)
+        data = _without_map_files(read_untrusted(path, code, *arguments[1:])) if reader is None else reader.read(code)
         seen = known.seen_at(data) if known is not None else None
         return Scene(data, device, reload=at) if seen is None else seen
 
     return at(time)
+
+
+def _without_map_files(data: SceneData) -> SceneData:
+    """An untrusted stage whose environment maps are drawn: their files would be decoded here, not in the child process."""
+    for k, each in enumerate(data.environment_maps):
+        if each.map_file:
+            data.environment_maps[k] = dataclasses.replace(each, map_file="")
+            data.notes.append(
+                Note(each.path, "environment map: the file of an untrusted stage is not read; drawn anew")
+            )
+    return data

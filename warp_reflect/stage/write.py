@@ -13,16 +13,20 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from pxr import Gf, Sdf, Tf, Usd, UsdUtils, Vt
 
+from warp_reflect.baked_environments import LAYOUT as ENVIRONMENT_LAYOUT
 from warp_reflect.baked_maps import LAYOUT, BakedMap
 from warp_reflect.stage.baked import GEOMETRY, LAYOUT_ATTRIBUTE, MAP, RESOLUTION, UNIT_FRAME
 from warp_reflect.stage.guard import Limits
 from warp_reflect.stage.intake import library_message
 from warp_reflect.stage.read import open_stage, quiet
+from warp_reflect.stage.schema import ENVIRONMENT_MAP_API
 
 EXTENSIONS = (".usd", ".usda", ".usdc")
 PROVENANCE = "warp_reflect"  # key in customLayerData
+PLACED_SCOPE = "reference_environment_maps"  # of the prims of maps that were placed
 MAP_NAME_MAX = 120  # characters of a map's file name that come from its prim path; file systems take 255 in all
 
 
@@ -107,7 +111,7 @@ def passing_name(path: Path) -> Path:
     return path.with_name(f".{os.getpid()}-{path.stem[:60]}.part{path.suffix}")
 
 
-# Baked reflector maps.
+# Baked maps.
 
 
 @dataclass(frozen=True)
@@ -123,6 +127,28 @@ class BakedMirror:
     prim_path: str
     file: Path
     maps: tuple[BakedMap, ...]
+
+
+@dataclass(frozen=True)
+class BakedEnvironment:
+    """A reference environment map, as a file beside the layer.
+
+    Attributes:
+        prim_path: Of the prim that names its place.
+        file: The EXR.
+        world_from_map: Where a prim is to be made for it, float64 [4, 4]; None: there is one.
+    """
+
+    prim_path: str
+    file: Path
+    world_from_map: np.ndarray | None = None
+
+
+def environment_path(stage: Usd.Stage, number: int) -> str:
+    """A path for the prim of a map that was placed: below the stage's default prim, where nothing is yet."""
+    root = stage.GetDefaultPrim()
+    parent = (root.GetPath() if root else Sdf.Path.absoluteRootPath).AppendChild(PLACED_SCOPE)
+    return str(parent.AppendChild(f"map_{number}"))
 
 
 def map_file(path: Path, prim_path: str, taken: set[str]) -> Path:
@@ -152,14 +178,15 @@ def write_baked_layer(
     stage_path: str | os.PathLike,
     path: str | os.PathLike,
     mirrors: Sequence[BakedMirror],
+    environments: Sequence[BakedEnvironment],
     provenance: Mapping[str, object],
 ) -> None:
-    """Write the layer that gives each mirror its maps.
+    """Write the layer that gives each mirror its maps, and each place of an environment map its own.
 
     Args:
         stage_path: What was baked.
         path: The layer; the maps' files lie in the same folder.
-        mirrors: May be empty.
+        mirrors, environments: May be empty.
         provenance: What is noted in the layer under `customLayerData["warp_reflect"]["bake"]`; str, int or float.
 
     Raises:
@@ -183,7 +210,30 @@ def write_baked_layer(
             # USD's matrices act on rows.
             frames = [Gf.Matrix4d(*each.unit_from_body.T.reshape(-1).tolist()) for each in mirror.maps]
             _author(prim, UNIT_FRAME, Sdf.ValueTypeNames.Matrix4dArray, Vt.Matrix4dArray(frames))
+        for each in environments:
+            _author_environment(layer, each)
         save_layer(layer, path)
+
+
+def _author_environment(layer: Sdf.Layer, baked: BakedEnvironment) -> None:
+    prim = Sdf.CreatePrimInLayer(layer, baked.prim_path)
+    if baked.world_from_map is not None:
+        scope = prim.nameParent
+        if scope.specifier != Sdf.SpecifierDef:
+            scope.specifier, scope.typeName = Sdf.SpecifierDef, "Scope"
+        prim.specifier, prim.typeName = Sdf.SpecifierDef, "Xform"
+        schemas = Sdf.TokenListOp()
+        schemas.prependedItems = [ENVIRONMENT_MAP_API]
+        prim.SetInfo("apiSchemas", schemas)
+        frame = Gf.Matrix4d(*baked.world_from_map.T.reshape(-1).tolist())
+        spec = Sdf.AttributeSpec(prim, "xformOp:transform", Sdf.ValueTypeNames.Matrix4d)
+        spec.default = frame
+        order = Vt.TokenArray(["!resetXformStack!", "xformOp:transform"])
+        _author(prim, "xformOpOrder", Sdf.ValueTypeNames.TokenArray, order)
+    # As the schema has it, the file may change in time.
+    file = Sdf.AttributeSpec(prim, MAP, Sdf.ValueTypeNames.Asset)
+    file.default = Sdf.AssetPath(f"./{baked.file.name}")
+    _author(prim, LAYOUT_ATTRIBUTE, Sdf.ValueTypeNames.Token, ENVIRONMENT_LAYOUT)
 
 
 def open_source(stage_path: str | os.PathLike) -> Usd.Stage:

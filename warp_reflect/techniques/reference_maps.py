@@ -7,6 +7,8 @@ there at any time: parts that move are left out of it with their shadows, and so
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,6 +30,7 @@ SEEN_SLACK = 1.0e-3  # of a distance: what a candidate meets so little before a 
 UNSEEN_MAX = 0.5  # radians; an error of what no map sees counts as at most this
 BURIED_SHARE = 0.5  # of what rays from a place meet: so many closed bodies from within, and it is inside a wall
 LEAST_GAIN = 0.02  # of the error: a map that takes off less is not placed
+DIGEST_BYTES = 16  # two worlds share a digest by chance once in 1e38
 COINCIDENT = 1.0e-6  # of the scene's size: places nearer than this are told
 KEY, PLACES_KEY = "reference maps", "places of reference maps"
 BYTES_FULL, BYTES_PACKED, BYTES_PALETTE = 20, 4, 8192
@@ -188,6 +191,14 @@ def place_maps(scene: Scene, settings: Settings) -> Placement:
     return Placement(("",) * len(chosen), centres, np.tile(np.eye(3), (len(chosen), 1, 1)), error, unseen)
 
 
+def told_of(placement: Placement) -> str:
+    """What is predicted of maps that were placed, for a note."""
+    return (
+        f"{len(placement.centres)} placed along the paths of its mirrors: {placement.error_px:.1f} texels predicted error, "
+        f"{100 * placement.unseen:.0f} % of what is reflected is seen by none"
+    )
+
+
 def predicted_error(scene: Scene, centres: np.ndarray, settings: Settings) -> tuple[float, float]:
     """What maps at some places (world, [n, 3]) are worth: see `Placement.error_px` and `Placement.unseen`."""
     positions, owners = _paths(scene, settings)
@@ -217,6 +228,37 @@ def draw_maps(scene: Scene, placement: Placement, settings: Settings) -> CubeMap
     )
 
 
+def world_digest(scene: Scene, settings: Settings) -> str:
+    """Digest, 32 hexadecimal digits, of what reference maps are drawn from: what stands still, its materials, the lights."""
+    digest = hashlib.blake2b(baked_environments.LAYOUT.encode(), digest_size=DIGEST_BYTES)
+
+    def add(value) -> None:
+        if isinstance(value, np.ndarray):
+            digest.update(f"{value.dtype.str}{value.shape}".encode())
+            digest.update(np.ascontiguousarray(value).tobytes())
+        elif dataclasses.is_dataclass(value):
+            for field in dataclasses.fields(value):
+                add(getattr(value, field.name))
+        elif isinstance(value, dict):
+            add(sorted(value))
+            add([value[key] for key in sorted(value)])
+        elif isinstance(value, (list, tuple)):
+            digest.update(str(len(value)).encode())
+            for item in value:
+                add(item)
+        else:
+            digest.update(repr(value).encode() + b"\n")
+
+    data = scene.data
+    still = [each for each in data.instances if not each.moves]
+    for number in sorted({each.mesh for each in still}):
+        add(data.meshes[number])
+    add(still)
+    add([data.materials, data.lights, data.pictures, asked_shadows(scene, settings)])
+    add([getattr(settings, name) for name in ("reflector_max_roughness", "reflector_min_weight")])
+    return digest.hexdigest()
+
+
 def authored(scene: Scene) -> Placement:
     """The places that the stage names."""
     given = scene.data.environment_maps
@@ -230,7 +272,7 @@ def _make(scene: Scene, settings: Settings) -> ReferenceMaps:
     asked = authored(scene)
     usable, told = usable_places(scene, settings)
     notes += told
-    texels = {k: texel for k, texel in _from_files(scene, notes).items() if k in usable}
+    texels = {k: texel for k, texel in _from_files(scene, settings, notes).items() if k in usable}
     rest = [k for k in usable if k not in texels]
     edge = settings.environment_resolution
     if texels and not rest:
@@ -255,27 +297,21 @@ def _make(scene: Scene, settings: Settings) -> ReferenceMaps:
             placement = Placement(("",), scene.origin[None].copy(), np.eye(3)[None])
         maps = draw_maps(scene, placement, settings)
         what = "none of its environment maps can be used" if asked.paths else "it names no places of environment maps"
-        count = len(placement.centres)
-        notes.append(
-            Note(
-                "/",
-                f"{what}; {count} placed along the paths of its mirrors: {placement.error_px:.1f} texels predicted error, "
-                f"{100 * placement.unseen:.0f} % of what is reflected is seen by none",
-            )
-        )
+        notes.append(Note("/", f"{what}; {told_of(placement)}"))
     # At another time the numbers of triangles are others: they are not kept.
     maps = pack_maps(maps) if settings.rem_texels == "packed" else maps.at(scene)
     return ReferenceMaps(maps, placement, tuple(notes), reach)
 
 
-def _from_files(scene: Scene, notes: list[Note]) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+def _from_files(scene: Scene, settings: Settings, notes: list[Note]) -> dict[int, tuple[np.ndarray, np.ndarray]]:
     """(radiance, distance) of the authored places whose files can be used, by number."""
     found = {}
+    world = world_digest(scene, settings) if any(each.map_file for each in scene.data.environment_maps) else ""
     for k, each in enumerate(scene.data.environment_maps):
         if not each.map_file:
             continue
         try:
-            found[k] = baked_environments.read_map(each)
+            found[k] = baked_environments.read_map(each, world)
         except (OSError, ValueError) as fault:
             notes.append(Note(each.path, f"environment map: {fault}; drawn anew"))
     return found
