@@ -15,6 +15,7 @@ import pytest
 
 import warp_reflect as wr
 from warp_reflect import cli, sweep, sweep_report
+from warp_reflect.realised import as_points
 from warp_reflect.settings import Settings
 from warp_reflect.techniques import TECHNIQUES
 
@@ -80,6 +81,17 @@ def test_contenders_cover_the_papers_settings(scene):
     assert {each.settings.reuse_px for each in every if each.warm} >= {0.25, 0.5, 1.0}
 
 
+def test_contenders_cover_the_settings_of_maps(scene):
+    every, _ = sweep.default_contenders(scene, None, SIZE)
+    for method in ("environment", "layered_environment"):
+        settings = [each.settings for each in every if each.method == method]
+        assert {each.environment_resolution for each in settings} >= set(sweep.ENVIRONMENT_RESOLUTIONS)
+        assert {each.environment_update for each in settings} == {"static", "frame"}
+    assert {each.rem_count for each in settings} >= set(sweep.REM_COUNTS)
+    assert {each.rem_limit for each in settings} >= set(sweep.REM_LIMITS)
+    assert {each.parallax_steps for each in settings} >= set(sweep.PARALLAX_STEPS)
+
+
 def test_choosing_refuses_a_name_that_fits_nothing(scene):
     every, _ = sweep.default_contenders(scene, None, SIZE)
     with pytest.raises(ValueError, match=r"'quadrik' names no contender.*quadric"):
@@ -105,13 +117,25 @@ def test_refined_rows_err_less_than_unrefined(measured):
 def test_rows_hold_plain_positive_numbers(measured):
     for row in measured.rows:
         assert row.reflect_ms > 0.0 and row.frame_ms > row.reflect_ms and row.first_ms > 0.0 and row.frame_cpu_ms > 0.0
-        assert row.compile_ms >= 0.0 and row.predicted_ms > 0.0
+        assert row.compile_ms >= 0.0 and row.predicted_ms > 0.0 and row.predicted_px >= 0.0
         shares = (row.identical_share, row.off_share, row.wrong_share, row.bvh_share, row.reused_share)
         assert all(0.0 <= share <= 1.0 for share in shares)
         assert row.error_median_px <= row.error_p95_px <= row.error_max_px
     assert measured.row(f"{sweep.ESTALELLA} grid 9.6 %").prepared_bytes >= 6 * 128 * 128 * 32
     assert measured.row("quadric reuse_px=1.0 refine=exact warm").reused_share > 0.0
     json.loads(json.dumps(measured.to_json(), allow_nan=False))
+
+
+def test_environment_maps_are_judged_by_what_lies_where_they_show_it(scene):
+    """Near things are shifted by many pixels: a map that is said to show the sky alone would have no error."""
+    every, _ = sweep.default_contenders(scene, None, SIZE, Settings(threads=1))
+    chosen = [each for each in every if each.name in (sweep.REFERENCE, "environment")]
+    row = sweep.run_sweep(scene, None, SIZE, chosen, rounds=1).row("environment")
+    assert row.error_p95_px > 1.0 and row.angle_median_deg > 0.1
+    reference = wr.render_frame(scene, wr.make_plan(scene, size=SIZE, method="reference"))
+    for name, image in as_points(reference).items():
+        own = reference.relative(name) if name == "reflectedPoint" else reference[name]
+        np.testing.assert_array_equal(image, own)
 
 
 def test_unrefined_picture_reports_the_point_it_shows(scene):

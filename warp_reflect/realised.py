@@ -86,6 +86,23 @@ def realised_error(frame: Frame, pixels: int = PIXELS) -> Realised:
     return Realised(len(error), median, p95, float(lost.sum() / len(error)))
 
 
+def as_points(frame: Frame) -> dict[str, np.ndarray]:
+    """The channels of `COMPARED` with environment maps judged by the points that lie where they show them, relative to the eye.
+
+    Of all else they are the frame's own.
+    """
+    width, height = frame.camera.size
+    layers, unrefined = dict(frame.layers), set()
+    for row in frame.plan.rows:
+        if row.technique == "environment" and row.reflector.id in layers:
+            layers[row.reflector.id] = _from_the_centre(frame, row, layers[row.reflector.id])
+        if row.technique == "environment" or (row.settings.refine == "off" and row.technique != "raytraced"):
+            unrefined.add(row.reflector.id)
+    found = reflection_channels(frame.scene, frame.gbuffer, layers, frame.plan.settings.threads, frozenset(unrefined))
+    images = {name: found[name].numpy() for name in COMPARED}
+    return {name: image.reshape(height, width, *image.shape[1:]) for name, image in images.items()}
+
+
 def _tiles(frame: Frame, pixels: int) -> list[tuple[int, int]]:
     """Corners (y, x) of the tiles to compare, evenly among those that show a mirror."""
     width, height = frame.camera.size

@@ -32,6 +32,7 @@ from warp_reflect.launch import thread_count
 from warp_reflect.layers import Camera
 from warp_reflect.metrics import Comparison, PixelClass, compare_frames
 from warp_reflect.planner import Plan, find_camera, make_plan
+from warp_reflect.realised import as_points
 from warp_reflect.scene import Scene
 from warp_reflect.settings import GRID_KINDS, REFINEMENTS, Settings
 from warp_reflect.techniques import TECHNIQUES
@@ -48,10 +49,15 @@ ERRORS_PX = (0.1, 0.5, 2.0)
 MAP_RESOLUTIONS = (32, 64, 128, 256, 512, 1024)
 EDGES_PX = (0.0, 0.1, 0.25, 1.0)
 REUSES_PX = (0.25, 0.5, 1.0)
+ENVIRONMENT_RESOLUTIONS = (32, 64, 128, 256, 512)
+REM_COUNTS = (1, 2, 3, 4)
+REM_LIMITS = (1, 4, 16)
+PARALLAX_STEPS = (0, 4, 12, 24)
 # Which techniques hear of a knob; those that are not there are left out.
 FORWARD = ("planar", "quadric", "reflector_map", "explosion_map")
 SEARCHED = ("reflector_map",)
 KEEPING = ("quadric", "reflector_map")  # keep virtual vertices from frame to frame
+MAPPED = ("environment", "layered_environment")
 # Of the camera about the mirrors' middle, per frame: a slow walk some metres away. What is kept from frame to frame is
 # kept for such; a brisk one (0.01) leaves little of it.
 STEP_RADIANS = 0.002
@@ -108,7 +114,9 @@ class Row:
     compile_ms: float = 0.0
     """What the first frame took longer where kernels had to be compiled, or loaded from the cache, for it."""
     predicted_ms: float = 0.0
-    """`budget.predict`, of the mirrors in view."""
+    """`budget.predict`, of the mirrors in view: of a frame among others for warm rows, of a first one else."""
+    predicted_px: float = 0.0
+    """Likewise: what 95 % of the pixels were predicted to stay below, of the worst mirror."""
     prepared_bytes: int = 0
     """Arrays that the technique holds from frame to frame, on the host and the device; the scene's are shared."""
     identical_share: float = 0.0
@@ -249,6 +257,13 @@ def default_contenders(
             for reuse in REUSES_PX:
                 add(method, warm=True, reuse_px=reuse, refine=refine)
         add("explosion_map", explosion_walk=0, refine=refine)
+    for method in MAPPED:
+        for resolution in ENVIRONMENT_RESOLUTIONS:
+            add(method, environment_resolution=resolution)
+        add(method, warm=True, environment_update="frame")
+    for knob, values in (("rem_count", REM_COUNTS), ("rem_limit", REM_LIMITS), ("parallax_steps", PARALLAX_STEPS)):
+        for value in values:
+            add("layered_environment", **{knob: value})
     seen: dict[tuple, Contender] = {}
     for each in found:
         seen.setdefault((each.method, each.settings, each.warm), each)
@@ -633,7 +648,8 @@ def _row(contender: Contender, plan: Plan, first: Frame, first_ms: float, loadin
         first_ms=first_ms,
         prepare_ms=first.timings.get("prepare", 0.0),
         compile_ms=max(loading_ms - first_ms, 0.0),
-        predicted_ms=sum(row.predicted["ms"] for row in seen),
+        predicted_ms=sum(row.predicted["ms" if contender.warm else "first_ms"] for row in seen),
+        predicted_px=max((row.predicted["error_px"] for row in seen), default=0.0),
         prepared_bytes=sum(held_bytes(plan.prepared(row)) for row in seen),
     )
 
@@ -679,9 +695,15 @@ def _judge(row: Row, frame: Frame, reference: Frame, result: Sweep) -> None:
 
 
 def _eye_channels(frame: Frame) -> dict[str, np.ndarray]:
-    """What two frames of one camera are compared by, points relative to the eye: not rounded at any offset."""
+    """What two frames of one camera are compared by, points relative to the eye: not rounded at any offset.
+
+    Environment maps hold no points: what lies where they show it, from their centre, stands for them.
+    """
     names = ("reflectorId", "reflectedId", "status", "pathLength", "R", "G", "B")
-    return {name: frame[name] for name in names} | {name: frame.relative(name) for name in POINTS}
+    channels = {name: frame[name] for name in names} | {name: frame.relative(name) for name in POINTS}
+    if any(row.technique == "environment" and row.reflector.id in frame.layers for row in frame.plan.rows):
+        channels |= as_points(frame)
+    return channels
 
 
 def _angles_deg(mine: dict, true: dict, where: np.ndarray) -> np.ndarray:

@@ -36,6 +36,7 @@ COLUMNS = (
     ("reflect_ms", ".1f", "reflect ms"),
     ("reflect_p95_ms", ".1f", "p95"),
     ("predicted_ms", ".1f", "predicted"),
+    ("predicted_px", ".2f", "predicted px"),
     ("frame_ms", ".1f", "frame ms"),
     ("frame_cpu_ms", ".1f", "frame CPU ms"),
     ("first_ms", ".0f", "first frame"),
