@@ -246,7 +246,7 @@ class Session:
         self.reference: Frame | None = None
         self.comparison: Comparison | None = None
         self.coarse = False
-        self._stale = True
+        self._stale = self._moved = True  # the frame is not the view's; nor is the plan
         self.picks: list[Pick] = []
         self.message = ""
         self.frame_ms = 0.0
@@ -304,7 +304,7 @@ class Session:
         small = tuple(max(side // COARSE, min(side, COARSE_MIN)) for side in self.size)
         # A plan renders at its own size. The coarse one shares what the techniques prepared.
         self._render(dataclasses.replace(self.plan, camera=cameras.resized(camera, small)), self.frame)
-        self.coarse = self._stale = True
+        self.coarse = self._stale = self._moved = True
         self.picks = []
         self.reference = self.comparison = None
 
@@ -312,7 +312,8 @@ class Session:
         """The full frame of the camera where it is; does nothing where it is shown already."""
         if not self._stale:
             return
-        self._replan()
+        if self._moved:
+            self._replan()
         self._render(self.plan, self.frame if self.settings.reuse_px > 0.0 else None)
         self.coarse = self._stale = False
         self.reference = self.comparison = None
@@ -531,7 +532,7 @@ class Session:
 
     def _replan(self) -> None:
         self.plan = self._planned(self.settings)
-        self._stale = True
+        self._stale, self._moved = True, False
 
     def _planned(self, settings: Settings) -> Plan:
         plan = make_plan(self.scene, self.camera, self.size, settings, self.method, earlier=self.plan)
