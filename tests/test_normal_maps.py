@@ -8,7 +8,6 @@ from test_textures import MATT, looking_down, picture_of, quad, scene_of
 
 from warp_reflect import normal_maps
 from warp_reflect.images import write_exr
-from warp_reflect.planner import make_plan
 from warp_reflect.scene import LightData, MaterialData, TextureRef
 
 TILTED = np.array([0.3, 0.5, 0.8]) / np.linalg.norm([0.3, 0.5, 0.8])
@@ -132,7 +131,7 @@ def test_bumps_are_seen_in_a_mirror(device, tmp_path):
     np.testing.assert_allclose(seen[hit >= 0, :3], direct[hit >= 0, :3], atol=1e-5)
 
 
-def test_reflector_keeps_its_own_normal(device, tmp_path):
+def test_reflector_keeps_its_own_normal_unless_asked(device, tmp_path):
     above = np.diag([1.0, 1.0, -1.0, 1.0])
     above[2, 3] = 4.0
     bumpy = dataclasses.replace(shown(tmp_path, TILTED), **{k: getattr(SILVER, k) for k in ("metallic", "roughness")})
@@ -212,11 +211,3 @@ def test_scene_without_maps_launches_nothing(device, monkeypatch):
     monkeypatch.setattr(normal_maps.launch, "launch", fail)
     scene = scene_of([(quad(), np.eye(4), MATT)], device)
     assert len(normal_maps.prepare_normals(scene, None, None)) == 0
-
-
-def test_normal_mapped_mirror_is_told_once(device, tmp_path):
-    mirror = dataclasses.replace(SILVER, textures=shown(tmp_path, TILTED).textures)
-    placed = [(quad(), np.eye(4), mirror), (quad(), np.diag([1.0, 1.0, -1.0, 1.0]), mirror)]
-    for materials, told in ((placed, 1), ([(mesh, world, MATT) for mesh, world, _ in placed], 0)):
-        plan = make_plan(scene_of(materials, device), looking_down(4.0), (64, 48), method="reference")
-        assert sum("normal map is not used" in note.text for note in plan.notes) == told

@@ -12,7 +12,13 @@ from warp_reflect.settings import Settings
 from warp_reflect.techniques import MAPS, planar
 
 # The effects of mirrors that are finishes, in the order in which they are applied, and the module of `finishes` of each.
-FINISHES: dict[str, str] = {"waves": "water", "roughness": "glossy", "fade": "fade"}
+FINISHES: dict[str, str] = {
+    "waves": "water",
+    "normal_map": "bumps",
+    "roughness": "glossy",
+    "clearcoat": "coat",
+    "fade": "fade",
+}
 # Those of what is seen through transparent surfaces.
 PANE_FINISHES: dict[str, str] = {"waves": "water", "frost": "frost"}
 UNASKED = FinishData("")
@@ -69,7 +75,9 @@ def finish_effects(
     finish = finish_of(material, settings)
     return {
         "waves": _waves(scene, part, finish, settings),
+        "normal_map": _normal_map(material, settings, technique),
         "roughness": _roughness(material, settings),
+        "clearcoat": _clearcoat(material, settings),
         "fade": _fade(finish, technique),
     }
 
@@ -180,3 +188,26 @@ def _roughness(material: MaterialData, settings: Settings) -> Effect:
     if not textured and material.roughness <= least:
         return Effect(False, f"{value} <= {least:g} (glossy_min_roughness)", numbers)
     return Effect(True, f"{value} > {least:g} (glossy_min_roughness), glossy={settings.glossy}", numbers)
+
+
+def _normal_map(material: MaterialData, settings: Settings, technique: str) -> Effect:
+    if "normal" not in material.textures:
+        return Effect(False, "no normal map")
+    if settings.bumps == "off":
+        return Effect(False, "bumps=off: it reflects at the surface itself")
+    if technique in MAPS:
+        return Effect(False, "maps are looked up with the surface's own normals")
+    return Effect(True, f"a texture of normal, bumps={settings.bumps}")
+
+
+def _clearcoat(material: MaterialData, settings: Settings) -> Effect:
+    if material.clearcoat == 0.0:
+        return Effect(False, "no clear coat")
+    if settings.glossy == "off":
+        return Effect(False, "glossy=off: base and coat show the same picture")
+    least, numbers = settings.glossy_min_roughness, {"roughness": material.clearcoat_roughness}
+    value = f"clear coat {material.clearcoat:.3g} of roughness {material.clearcoat_roughness:.3g}"
+    textured = {"roughness", "clearcoat_roughness"} & material.textures.keys()
+    if not textured and max(material.roughness, material.clearcoat_roughness) <= least:
+        return Effect(False, f"{value}: base and coat are smooth (glossy_min_roughness={least:g})", numbers)
+    return Effect(True, f"{value} over a base of {material.roughness:.3g}", numbers)

@@ -313,7 +313,8 @@ def _shown(
 ) -> tuple[shade.Shown, transmission.Met]:
     """What the eye sees, with the waves on it; how rays see mirrors and, in the former alone, through surfaces."""
     threads = plan.settings.threads
-    shown = shade.look(scene, gbuffer, threads, plan.shadows)
+    bumpy = [row.reflector.id for row in plan.rows if row.effects["normal_map"].on]
+    shown = shade.look(scene, gbuffer, threads, plan.shadows, bumpy)
     surfaces = [*((row.reflector.part, row) for row in plan.rows), *((pane.part, pane) for pane in plan.panes)]
     wavy = {part: row.settings for part, row in surfaces if row.effects["waves"].on}
     if wavy:

@@ -1,4 +1,4 @@
-"""Normal maps: the normals that they give to what a frame shows, where it is no reflector.
+"""Normal maps: the normals that they give to what a frame shows; to reflectors where they are asked to (`finishes/bumps.py`).
 
 A map's directions are in the tangent space of its picture: x along its u, y along its v, z along the surface's normal.
 The tangents come from the corners' points and texture coordinates, triangle by triangle; no tangent primvar is needed.
@@ -7,6 +7,9 @@ Kernels of their own, so that a scene without normal maps pays nothing.
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
+import numpy as np
 import warp as wp
 
 from warp_reflect import launch
@@ -89,13 +92,19 @@ def eye_normals_kernel(
     textures: TextureSet,
     triangle: wp.array(dtype=int),
     reflector_id: wp.array(dtype=int),
+    bumpy: wp.array(dtype=int),
     out_normals: wp.array(dtype=wp.vec3),
 ):
     """One thread per pixel."""
     i = first + wp.tid()
     tri = triangle[i]
-    if tri < 0 or reflector_id[i] > 0:
+    if tri < 0:
         return
+    if reflector_id[i] > 0:
+        if reflector_id[i] >= bumpy.shape[0]:
+            return
+        if bumpy[reflector_id[i]] == 0:
+            return
     row = i // camera.width
     x = float(i - row * camera.width) + 0.5
     y = float(row) + 0.5
@@ -137,7 +146,13 @@ def mirrored_normals_kernel(
     out_normals[i] = mapped_normal(scene, textures, triangle[i], u[i], v[i], direction[i], width)
 
 
-def prepare_normals(scene: Scene, gbuffer: GBuffer, layer: ReflectionLayer | None, threads: int = 0) -> wp.array:
+def prepare_normals(
+    scene: Scene,
+    gbuffer: GBuffer,
+    layer: ReflectionLayer | None,
+    threads: int = 0,
+    bumpy: Collection[int] = (),
+) -> wp.array:
     """The normals that normal maps give to what a frame shows.
 
     Args:
@@ -145,6 +160,7 @@ def prepare_normals(scene: Scene, gbuffer: GBuffer, layer: ReflectionLayer | Non
         gbuffer: What the eye sees, with its `reflector_id` set.
         layer: What is seen in a mirror; None: of what the eye sees itself.
         threads: CPU threads; 0: one per core.
+        bumpy: Ids of the reflectors that have their map's normals where the eye sees them; others have their own.
 
     Returns:
         Unit vec3 [pixels of the G-buffer or of the layer] towards the viewer's side, 0 where the surface's own normal
@@ -155,7 +171,10 @@ def prepare_normals(scene: Scene, gbuffer: GBuffer, layer: ReflectionLayer | Non
         return wp.zeros(0, dtype=wp.vec3, device=scene.device)
     if layer is None:
         normals = wp.zeros(len(gbuffer.triangle), dtype=wp.vec3, device=scene.device)
-        inputs = [scene.view, gbuffer.view, textures, gbuffer.triangle, gbuffer.reflector_id, normals]
+        inputs = [scene.view, gbuffer.view, textures, gbuffer.triangle, gbuffer.reflector_id]
+        marked = np.zeros(max(bumpy, default=-1) + 1, np.int32)
+        marked[list(bumpy)] = 1
+        inputs += [wp.array(marked, dtype=int, device=scene.device), normals]
         launch.launch(eye_normals_kernel, len(normals), inputs, scene.device, threads)
         return normals
     pixels = layer.pixels

@@ -323,11 +323,6 @@ def make_plan(
         row.effects["second_bounce"] = bounce_effect(visible, alone, mirrored, settings)
         row.effects["shadows"] = _shadows(lights, visible)
     panes = [_pane(scene, view, settings, k, pixels[k]) for k in clear]
-    bumpy = [scene.data.materials[part.material] for _, part, _ in found]
-    for path in dict.fromkeys(material.path for material in bumpy if "normal" in material.textures):
-        notes.append(
-            Note(path, "texture of normal: a mirror reflects at the surface itself; its normal map is not used")
-        )
     notes += _too_rough(scene, settings)
     if settings.kernels != "plain" and not scene.device.is_cuda and vector.missing():
         notes.append(Note("", f"plain kernels only: {vector.missing()} (kernels={settings.kernels})"))

@@ -66,6 +66,7 @@ REM_TEXELS = ("packed", "full")
 REM_MISSING = ("shade", "best")
 ENVIRONMENT_UPDATES = ("static", "frame", "previous")
 FIELDS = ("auto", "heightfield", "occupancy")
+BUMPS = ("lookup", "traced", "off")
 GLOSSY = ("filter", "accumulate", "off")
 KERNELS = ("auto", "plain", "vector")
 WAVES = ("lookup", "traced", "off")
@@ -180,6 +181,9 @@ class Settings:
     """Edge of a column of the heightfield, or of a cell of the grid; 0: automatic. [scene units]"""
     field_overhang: float = 0.02
     """Share of the columns with free space under a roof above which `auto` takes the grid."""
+    bumps: str = "traced"
+    """Normal maps of mirrors: `traced` follows every turned ray, `lookup` looks it up in the smooth picture first,
+    `off` reflects at the surface itself."""
     glossy: str = "filter"
     """Rough mirrors: `filter` (look-ups in the sharp picture), `accumulate` (rays of the lobe: the reference), or `off`."""
     glossy_samples: int = 0
@@ -251,6 +255,7 @@ class Settings:
         _require(self.field_kind in FIELDS, "field_kind", self.field_kind, f"one of {', '.join(FIELDS)}")
         _require(0.0 <= self.field_cell <= 1.0e9, "field_cell", self.field_cell, "0 (automatic) or a length")
         _require(0.0 <= self.field_overhang <= 1.0, "field_overhang", self.field_overhang, "0 to 1")
+        _require(self.bumps in BUMPS, "bumps", self.bumps, f"one of {', '.join(BUMPS)}")
         _require(self.glossy in GLOSSY, "glossy", self.glossy, f"one of {', '.join(GLOSSY)}")
         _require(0 <= self.glossy_samples <= 65536, "glossy_samples", self.glossy_samples, "0 (its own) to 65536")
         _require(0.0 <= self.glossy_min_roughness <= 1.0, "glossy_min_roughness", self.glossy_min_roughness, "0 to 1")

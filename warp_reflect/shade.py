@@ -12,7 +12,7 @@ Approximates UsdPreviewSurface, textures included (`textures.py`):
   mirrors whatever its roughness, and a finish (`finishes/glossy.py`) gives its mirror image the lobe's shape;
 * the clear coat's roughness divides its share as the base's is divided;
 * energy: what the clear coat and the mirror term take is taken from the layers below;
-* normal maps turn the normal of what is no reflector, seen directly or in one; a reflector keeps its own.
+* normal maps turn the normal of what is no reflector, seen directly or in one, and of a reflector where the plan says so.
 
 What is seen through a surface is not here (`transmission.py`), but its share is left for it. The background is the dome;
 alpha is coverage.
@@ -20,7 +20,7 @@ alpha is coverage.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -539,7 +539,9 @@ def seen_radiance(
     return radiance
 
 
-def look(scene: Scene, gbuffer: GBuffer, threads: int = 0, shadows: Shadows | None = None) -> Shown:
+def look(
+    scene: Scene, gbuffer: GBuffer, threads: int = 0, shadows: Shadows | None = None, bumpy: Collection[int] = ()
+) -> Shown:
     """What the eye sees, with what textures and normal maps say of it.
 
     Args:
@@ -547,8 +549,9 @@ def look(scene: Scene, gbuffer: GBuffer, threads: int = 0, shadows: Shadows | No
         gbuffer: With its `reflector_id` set.
         threads: CPU threads; 0: one per core.
         shadows: Which lights cast shadows on what is seen in mirrors; None: none.
+        bumpy: Ids of the reflectors that have the normals of their maps.
     """
-    looks, normals = prepare_looks(scene, gbuffer, None, threads), prepare_normals(scene, gbuffer, None, threads)
+    looks, normals = prepare_looks(scene, gbuffer, None, threads), prepare_normals(scene, gbuffer, None, threads, bumpy)
     return Shown(gbuffer, looks, normals, lambda layer: seen_radiance(scene, gbuffer, layer, threads, shadows))
 
 

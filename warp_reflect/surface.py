@@ -83,6 +83,15 @@ def shown_normal(normals: wp.array(dtype=wp.vec3), i: int, own: wp.vec3) -> wp.v
 
 
 @wp.func
+def turned_reflection(direction: wp.vec3, n: wp.vec3, turned_normal: wp.vec3) -> wp.vec3:
+    """Where another normal than n reflects what n reflects along `direction`; never into the surface."""
+    incident = direction - 2.0 * wp.dot(direction, n) * n
+    turned = incident - 2.0 * wp.dot(incident, turned_normal) * turned_normal
+    into = wp.min(wp.dot(turned, n), 0.0)
+    return unit(turned - 2.0 * into * n)
+
+
+@wp.func
 def polish(scene: SceneView, triangle: int, p: wp.vec3, direction: wp.vec3) -> wp.vec4:
     """Move a point near a facet along its ray onto the analytic surface behind the facet.
 

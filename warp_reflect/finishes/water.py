@@ -21,7 +21,7 @@ from warp_reflect.layers import CameraView, MirrorPixels, ReflectionLayer
 from warp_reflect.optics import refract
 from warp_reflect.scene import Scene, SceneView
 from warp_reflect.shapes import facet_normal, unit
-from warp_reflect.surface import shown_normal
+from warp_reflect.surface import shown_normal, turned_reflection
 from warp_reflect.transmission import Through, Transmission, look_through, through_radiance
 
 wp.set_module_options({"enable_backward": False})
@@ -55,15 +55,6 @@ def shifted_radiance(pyramid: Pyramid, own: wp.vec2, at: wp.vec2, otherwise: wp.
             return wp.vec3(found.color[0], found.color[1], found.color[2]) / found.color[3]
         shift = 0.5 * shift
     return otherwise
-
-
-@wp.func
-def turned_reflection(direction: wp.vec3, n: wp.vec3, wave: wp.vec3) -> wp.vec3:
-    """Where a wave's normal reflects what the still surface reflects along `direction`; never into the surface."""
-    incident = direction - 2.0 * wp.dot(direction, n) * n
-    turned = incident - 2.0 * wp.dot(incident, wave) * wave
-    into = wp.min(wp.dot(turned, n), 0.0)
-    return unit(turned - 2.0 * into * n)
 
 
 @wp.kernel
