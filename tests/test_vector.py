@@ -1,14 +1,17 @@
 """Vector kernels against the plain ones: the same bits, on every shape of triangle and on every scene."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import warp as wp
-from rooms import placed, plane_room, room, sphere
+from rooms import CHROME, placed, plane_room, room, sphere, square
 
 import warp_reflect as wr
 from warp_reflect import vector
 from warp_reflect.layers import CameraView
 from warp_reflect.raster import make_target, rasterise
+from warp_reflect.scene import CameraData, InstanceData, LightData, MaterialData, Scene, SceneData
 
 wp.set_module_options({"enable_backward": False})
 CPU = wp.get_device("cpu")
@@ -155,3 +158,67 @@ def test_unknown_kernels_are_refused_and_missing_ones_are_told(monkeypatch):
         if "kernels" in n.text
     ]
     assert wr.render_frame(scene, plan)["RGBA"].max() > 0
+
+
+def lit_room(lights, projection="perspective"):
+    """Every kind of surface there is to shade: analytic, smooth, flat, coloured per corner, coated, see-through, a speck."""
+    rng = np.random.default_rng(3)
+    colors = rng.random((300, 3)).astype(np.float32)
+    smooth = dataclasses.replace(sphere(9, 14), parts=[])
+    # Normals that cancel between the corners of a facet.
+    torn = dataclasses.replace(smooth, normals=(smooth.normals * rng.choice([-1.0, 1.0], (len(smooth.normals), 1))))
+    painted = dataclasses.replace(smooth, normals=None, colors=colors[: len(smooth.points)])
+    meshes = [sphere(), square(6, 6.0), smooth, dataclasses.replace(torn, normals=np.float32(torn.normals)), painted]
+    materials = [
+        CHROME,
+        MaterialData(),
+        MaterialData(base_color=(0.1, 0.5, 0.3), clearcoat=0.6, clearcoat_roughness=0.1, roughness=0.2),
+        MaterialData(metallic=0.7, roughness=0.15, uses_vertex_color=True),
+        MaterialData(emissive=(0.3, 0.0, 1.0), opacity=0.5, transmission=0.4, roughness=0.1),
+    ]
+    where = [(0, 0, -1.5, 1.0), (0, -1, 0, 1.0), (-1.6, -0.3, 0.5, 0.5), (1.6, 0.1, 0.4, 0.6), (0.9, -0.6, 1.5, 0.4)]
+    instances = [InstanceData(k, placed(*at), f"/p{k}", (k % 5,)) for k, at in enumerate(where)]
+    instances.append(InstanceData(2, placed(0, 0, 2, 1e-13), "/speck", (4,)))
+    instances.append(InstanceData(4, placed(-0.8, 0.9, 1.0, 0.4), "/painted", (3,)))
+    camera = CameraData("/camera", placed(0.1, 0.3, 4.0), projection, near=0.05, focal_length=22.0)
+    if projection == "orthographic":
+        camera = dataclasses.replace(camera, horizontal_aperture=60.0, vertical_aperture=40.0)
+    return Scene(SceneData("lit", meshes, instances, materials, lights, [camera]))
+
+
+def lights_of(kind):
+    texture = np.random.default_rng(7).random((6, 11, 3)).astype(np.float32)
+    turn = np.eye(4)
+    turn[:3, :3] = [[0, 1, 0], [0, 0, 1], [1, 0, 0]]
+    dome = LightData("/dome", "dome", (0.5, 0.7, 0.9), turn, texture)
+    sun = LightData("/sun", "distant", (2.0, 1.9, 1.7), turn)
+    # So near the floor that it sets for parts of it, and around the eye of some points.
+    low = LightData("/low", "sphere", (3.0, 2.0, 1.0), placed(-0.6, -0.9, 0.9), size=(0.5,))
+    far = LightData("/far", "sphere", (40.0, 50.0, 60.0), placed(2, 4, 1), size=(0.2,))
+    tube = LightData("/tube", "cylinder", (3.0, 2.0, 1.0), placed(0, 2, 0), size=(1.0, 0.1))
+    return {
+        "none": [],
+        "dome": [dome],
+        "sun": [sun, LightData("/grey", "dome", (0.2, 0.2, 0.2), np.eye(4))],
+        "spheres": [low, far, sun],
+        "shapes": [low, tube],
+    }[kind]
+
+
+@pytest.mark.parametrize("shadows", [False, True])
+@pytest.mark.parametrize("projection", ["perspective", "orthographic"])
+@pytest.mark.parametrize("kind", ["none", "dome", "sun", "spheres", "shapes"])
+def test_every_surface_is_shaded_as_the_plain_kernels_do(kind, projection, shadows):
+    scene = lit_room(lights_of(kind), projection)
+    frames = {}
+    for kernels, threads in (("plain", 1), ("vector", 1), ("vector", 2)):
+        settings = wr.Settings(kernels=kernels, threads=threads, shadows=shadows, shadow_samples=1)
+        plan = wr.make_plan(scene, size=(107, 61), settings=settings, method="reference")
+        frames[kernels, threads] = wr.render_frame(scene, plan)
+    plain, vectors = frames["plain", 1], frames["vector", 1]
+    assert len(np.unique(plain["primId"])) >= 6 and (plain["reflectedId"] > 0).sum() > 100
+    for channel in ("RGBA", "reflection"):
+        assert np.isfinite(vectors[channel]).all()
+        # Sums of some twenty products each: 16 units in the last place.
+        np.testing.assert_allclose(vectors[channel], plain[channel], rtol=16 * 2.0**-23, atol=1e-6, err_msg=channel)
+        np.testing.assert_array_equal(frames["vector", 2][channel], vectors[channel], err_msg=channel)

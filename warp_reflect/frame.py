@@ -246,7 +246,9 @@ def render_frame(scene: Scene, plan: Plan, camera: str | Camera | None = None, p
         with timer("shade"):
             shown, met = _shown(scene, plan, gbuffer, interfaces)
             finish = _finish(scene, plan)
-            picture = shade.shade(scene, gbuffer, layers, settings.threads, plan.shadows, finish, shown)
+            picture = shade.shade(
+                scene, gbuffer, layers, settings.threads, plan.shadows, finish, shown, settings.kernels
+            )
         transmitted = {}
         if interfaces is not None:
             with timer("transmission"):
@@ -314,7 +316,7 @@ def _shown(
     """What the eye sees, with the waves on it; how rays see mirrors and, in the former alone, through surfaces."""
     threads = plan.settings.threads
     bumpy = [row.reflector.id for row in plan.rows if row.effects["normal_map"].on]
-    shown = shade.look(scene, gbuffer, threads, plan.shadows, bumpy)
+    shown = shade.look(scene, gbuffer, threads, plan.shadows, bumpy, plan.settings.kernels)
     surfaces = [*((row.reflector.part, row) for row in plan.rows), *((pane.part, pane) for pane in plan.panes)]
     wavy = {part: row.settings for part, row in surfaces if row.effects["waves"].on}
     if wavy:

@@ -26,8 +26,8 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from warp_reflect import launch
-from warp_reflect.direct import AREA_KINDS, DirectView, direct_irradiance, points_of, prepare_direct
+from warp_reflect import launch, vector
+from warp_reflect.direct import AREA_KINDS, AreaView, DirectView, direct_irradiance, points_of, prepare_direct
 from warp_reflect.layers import CameraView, GBuffer, ReflectionLayer, eye_ray_direction, eye_ray_origin
 from warp_reflect.normal_maps import prepare_normals
 from warp_reflect.scene import SHAPE_QUADRIC, Scene, SceneView
@@ -492,6 +492,7 @@ def arriving(
     normals: wp.array,
     threads: int = 0,
     shadows: Shadows | None = None,
+    without_areas: bool = False,
 ) -> tuple[wp.array, wp.array]:
     """The light that reaches what a frame shows, as far as it is not the same everywhere.
 
@@ -499,6 +500,7 @@ def arriving(
         layer: What is seen in a mirror; None: of what the eye sees itself.
         normals: From `normal_maps.prepare_normals`.
         shadows: Which lights cast shadows; None: none.
+        without_areas: The shapes' light is added where it is used, see `summed_late`.
 
     Returns:
         (irradiance of distant lights and shapes vec3 [n], length 0 where there are neither shapes nor shadows: the distant
@@ -507,22 +509,39 @@ def arriving(
     direct = wp.zeros(0, dtype=wp.vec3, device=scene.device)
     sky = wp.zeros(0, dtype=float, device=scene.device)
     asked = shadows is not None and scene.triangle_count > 0
-    if not asked and len(scene.lights.direct.areas) == 0:
+    areas = 0 if without_areas else len(scene.lights.direct.areas)
+    if not asked and areas == 0:
         return direct, sky
     points = points_of(scene, gbuffer, layer, threads)
     if asked and shadows.direct:
         direct = shadowed_irradiance(scene, points, shadows, threads, normals)
-    elif len(scene.lights.direct.areas) > 0:
+    elif areas > 0:
         direct = direct_irradiance(scene, scene.lights.direct, points, threads, normals)
     if asked and shadows.domes:
         sky = sky_share(scene, points, shadows.samples, threads, normals)
     return direct, sky
 
 
+def summed_late(scene: Scene, shadows: Shadows | None) -> wp.array:
+    """The shapes whose light the vector kernels add themselves, `AreaView`: all, where they are spheres without shadows."""
+    kinds = {light.kind for light in scene.data.lights} & set(AREA_KINDS)
+    if kinds == {"sphere"} and not (shadows is not None and shadows.direct):
+        return scene.lights.direct.areas
+    return wp.zeros(0, dtype=AreaView, device=scene.device)
+
+
 def seen_radiance(
-    scene: Scene, gbuffer: GBuffer, layer: ReflectionLayer, threads: int = 0, shadows: Shadows | None = None
+    scene: Scene,
+    gbuffer: GBuffer,
+    layer: ReflectionLayer,
+    threads: int = 0,
+    shadows: Shadows | None = None,
+    kernels: str = "auto",
 ) -> wp.array:
     """What a mirror's pixels see, before the mirror's own weight.
+
+    Args:
+        kernels: `Settings.kernels`.
 
     Returns:
         Linear RGB radiance, vec3 [layer.pixels.count]: the layer's own where it has one (maps), else that of its hits.
@@ -532,15 +551,29 @@ def seen_radiance(
     pixels = layer.pixels
     looks = prepare_looks(scene, gbuffer, layer, threads)
     normals = prepare_normals(scene, gbuffer, layer, threads)
-    direct, sky = arriving(scene, gbuffer, layer, normals, threads, shadows)
     radiance = wp.empty(pixels.count, dtype=wp.vec3, device=scene.device)
+    if vector.chosen(kernels, scene.device):
+        from warp_reflect import shade_vector  # which shades with this module's structures
+
+        areas = summed_late(scene, shadows)
+        direct, sky = arriving(scene, gbuffer, layer, normals, threads, shadows, len(areas) > 0)
+        inputs = [scene.view, scene.triangle_records, scene.lights, areas, looks, normals, direct, sky]
+        inputs += [SHARP_ROUGHNESS, ROUGH_ROUGHNESS, pixels.direction, layer.triangle, layer.u, layer.v, radiance]
+        vector.launch_blocks(shade_vector.seen_blocks_kernel, pixels.count, inputs, scene.device, threads)
+        return radiance
+    direct, sky = arriving(scene, gbuffer, layer, normals, threads, shadows)
     inputs = [scene.view, scene.lights, looks, normals, direct, sky, pixels.direction, layer.triangle, layer.u, layer.v]
     launch.launch(seen_radiance_kernel, pixels.count, [*inputs, radiance], scene.device, threads)
     return radiance
 
 
 def look(
-    scene: Scene, gbuffer: GBuffer, threads: int = 0, shadows: Shadows | None = None, bumpy: Collection[int] = ()
+    scene: Scene,
+    gbuffer: GBuffer,
+    threads: int = 0,
+    shadows: Shadows | None = None,
+    bumpy: Collection[int] = (),
+    kernels: str = "auto",
 ) -> Shown:
     """What the eye sees, with what textures and normal maps say of it.
 
@@ -550,9 +583,10 @@ def look(
         threads: CPU threads; 0: one per core.
         shadows: Which lights cast shadows on what is seen in mirrors; None: none.
         bumpy: Ids of the reflectors that have the normals of their maps.
+        kernels: `Settings.kernels`.
     """
     looks, normals = prepare_looks(scene, gbuffer, None, threads), prepare_normals(scene, gbuffer, None, threads, bumpy)
-    return Shown(gbuffer, looks, normals, lambda layer: seen_radiance(scene, gbuffer, layer, threads, shadows))
+    return Shown(gbuffer, looks, normals, lambda layer: seen_radiance(scene, gbuffer, layer, threads, shadows, kernels))
 
 
 def shade(
@@ -563,6 +597,7 @@ def shade(
     shadows: Shadows | None = None,
     finish: Finish | None = None,
     shown: Shown | None = None,
+    kernels: str = "auto",
 ) -> tuple[wp.array, wp.array]:
     """The picture of a frame.
 
@@ -575,21 +610,31 @@ def shade(
         finish: Turns what a sharp mirror's pixels see (vec3 [layer.pixels.count]) into what this mirror's do; None: all
             are sharp.
         shown: What the eye sees, where more is known of it than `look` tells.
+        kernels: `Settings.kernels`.
 
     Returns:
         (linear RGB radiance and coverage, vec4 [height * width]; the reflectors' mirror term alone, vec3
         [height * width], 0 elsewhere).
     """
-    shown = shown or look(scene, gbuffer, threads, shadows)
+    shown = shown or look(scene, gbuffer, threads, shadows, kernels=kernels)
     count = gbuffer.camera.size[0] * gbuffer.camera.size[1]
     device = scene.device
     lights, looks, normals = scene.lights, shown.looks, shown.normals
     picture = wp.empty(count, dtype=wp.vec4, device=device)
     mirror = wp.empty(count, dtype=wp.vec3, device=device)
-    direct, sky = arriving(scene, gbuffer, None, normals, threads, shadows)
-    inputs = [scene.view, gbuffer.view, lights, looks, normals, direct, sky, gbuffer.triangle, gbuffer.reflector_id]
-    inputs += [picture, mirror]
-    launch.launch(shade_kernel, count, inputs, device, threads)
+    seen = [gbuffer.triangle, gbuffer.reflector_id, picture, mirror]
+    if vector.chosen(kernels, device):
+        from warp_reflect import shade_vector  # which shades with this module's structures
+
+        areas = summed_late(scene, shadows)
+        direct, sky = arriving(scene, gbuffer, None, normals, threads, shadows, len(areas) > 0)
+        inputs = [scene.view, scene.triangle_records, gbuffer.view, lights, areas, looks, normals, direct, sky]
+        inputs += [SHARP_ROUGHNESS, ROUGH_ROUGHNESS, *seen]
+        vector.launch_blocks(shade_vector.shade_blocks_kernel, count, inputs, device, threads)
+    else:
+        direct, sky = arriving(scene, gbuffer, None, normals, threads, shadows)
+        inputs = [scene.view, gbuffer.view, lights, looks, normals, direct, sky, *seen]
+        launch.launch(shade_kernel, count, inputs, device, threads)
     for layer in layers.values():
         radiance = shown.seen(layer)
         if finish is not None:

@@ -578,7 +578,9 @@ def shade_texels(
     camera = face_camera(scene, centre, axes, 0, n)  # of any face: it tells the size of a texel
     gbuffer = GBuffer(camera, camera.view(scene), triangle, u)
     layer = hits_layer(point, direction, triangle, u, v)
-    radiance = shade.seen_radiance(scene, gbuffer, layer, settings.threads, asked_shadows(scene, settings))
+    radiance = shade.seen_radiance(
+        scene, gbuffer, layer, settings.threads, asked_shadows(scene, settings), settings.kernels
+    )
     if onward is not None:
         onward(gbuffer, layer, radiance)
     launch.launch(put_radiance_kernel, count, [texel, radiance, local.view.radiance], device, settings.threads)
