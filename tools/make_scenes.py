@@ -332,6 +332,16 @@ def _two_spheres(w: Writer) -> None:
     w.lights()
 
 
+def _red_blue_balls(w: Writer) -> None:
+    """Far enough apart that an environment map at a ball's centre shows the other where it is."""
+    arena(w, 7.0, 28)
+    w.sphere("/World/RedBall", (-1.45, 1.005, 0), 1.0, "RedMirror")
+    w.sphere("/World/BlueBall", (1.45, 1.005, 0.3), 1.0, "BlueMirror")
+    boxes(w, (-0.1, 1.5, 0.4, 0.4, 15, "Yellow"), (0.2, -1.4, 0.5, 1.0, 40, "White"))
+    w.camera((0.0, 1.7, 5.6), (0.0, 0.9, 0), 34)
+    w.lights()
+
+
 def _open_bowl(w: Writer) -> None:
     """A thin double-sided shell: its rim is a border, and inside it sees itself."""
     d = w.detail
@@ -399,6 +409,11 @@ SCENES = {
         ("/World/Cylinder", "/World/Capsule"),
     ),
     "two_spheres": Recipe(_two_spheres, "Two spheres that see each other", ("/World/Left", "/World/Right")),
+    "red_blue_balls": Recipe(
+        _red_blue_balls,
+        "A red and a blue mirror ball: mirrors in mirrors; after Real-Time Rendering, section 9.3.2",
+        ("/World/RedBall", "/World/BlueBall"),
+    ),
     "open_bowl": Recipe(
         _open_bowl,
         "An open double-sided bowl: half an ellipsoid, from outside and from within",

@@ -43,6 +43,8 @@ class Look:
 
 LOOKS = {
     "Chrome": Look((0.9, 0.9, 0.92), 1.0, 0.0),
+    "RedMirror": Look((0.85, 0.12, 0.1), 1.0, 0.0),
+    "BlueMirror": Look((0.12, 0.2, 0.85), 1.0, 0.0),
     "Black": Look((0.02, 0.02, 0.022)),
     "White": Look((0.82, 0.81, 0.78)),
     "Cream": Look((0.78, 0.7, 0.55)),

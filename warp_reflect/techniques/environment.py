@@ -18,6 +18,7 @@ import numpy as np
 from warp_reflect import bvh, raster, surface
 from warp_reflect.environment_maps import CubeMaps, Onward, look_up, render_maps
 from warp_reflect.layers import Camera, GBuffer, MirrorPixels, ReflectionLayer
+from warp_reflect.reflectors import mirror_weight
 from warp_reflect.scene import Scene
 from warp_reflect.settings import Settings, Status, Technique
 from warp_reflect.shadows import asked_shadows
@@ -67,9 +68,13 @@ def left_out(scene: Scene, part: int) -> tuple[int, ...]:
     others = (
         ()
         if seen is None
-        else (k for k, other in enumerate(scene.parts) if other.triangle_count and not seen[other.first_triangle])
+        else (
+            k
+            for k, other in enumerate(scene.parts)
+            if k != part and other.triangle_count and not seen[other.first_triangle]
+        )
     )
-    return tuple({part, *others})
+    return (part, *others)
 
 
 def prepare(scene: Scene, reflector, settings: Settings) -> Prepared:
@@ -114,14 +119,15 @@ def reflect(
 def _draw(scene: Scene, part: int, centre: np.ndarray, settings: Settings, before=None) -> tuple[CubeMaps, int]:
     resolution = settings.environment_resolution
     options = {"shadows": asked_shadows(scene, settings), "threads": settings.threads}
-    onward = onward_of(scene, settings, before)
+    onward = onward_of(scene, part, settings, before)
     return render_maps(scene, centre[None], resolution, without=[left_out(scene, part)], onward=onward, **options), 0
 
 
-def onward_of(scene: Scene, settings: Settings, before: dict[int, Shown] | None = None) -> Onward | None:
-    """What mirrors seen in a map show: maps of their own, as `bounces` and `environment_update` ask; None: the domes.
+def onward_of(scene: Scene, part: int, settings: Settings, before: dict[int, Shown] | None = None) -> Onward | None:
+    """What mirrors in a mirror's map show: maps of their own, as `bounces` and `environment_update` ask; None: the domes.
 
     Args:
+        part: The mirror whose map it is; without another in the scene nothing is drawn for it.
         before: By reflector id the maps of the previous frame, where that is what is asked for.
     """
     if settings.environment_update == "previous":
@@ -130,7 +136,9 @@ def onward_of(scene: Scene, settings: Settings, before: dict[int, Shown] | None 
         from warp_reflect.techniques import mirror_maps
 
         return mirror_maps.of_previous_frame(scene, before)
-    if settings.bounces <= 1:
+    gone = left_out(scene, part)
+    others = (k for k, other in enumerate(scene.parts) if k not in gone and other.triangle_count)
+    if settings.bounces <= 1 or not any(mirror_weight(scene, scene.parts[k], settings) for k in others):
         return None
     from warp_reflect.techniques import mirror_maps
 

@@ -9,15 +9,16 @@ with Distance Impostors, Eurographics 2005, who have distances only; a triangle'
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from time import perf_counter
 
 import numpy as np
 import warp as wp
 
 from warp_reflect import bvh, launch
-from warp_reflect.environment_maps import CubeMaps, CubeMapsView, fetch_radiance, nearest_texel
+from warp_reflect.environment_maps import CubeMaps, CubeMapsView, Onward, fetch_radiance, nearest_texel
 from warp_reflect.layers import Camera, GBuffer, MirrorPixels, ReflectionLayer
+from warp_reflect.reflectors import mirror_weight
 from warp_reflect.scene import Note, Scene, SceneView
 from warp_reflect.settings import Settings, Status, Technique
 from warp_reflect.shade import LightView
@@ -36,6 +37,7 @@ SKY = wp.constant(int(Status.SKY))
 HIDDEN = wp.constant(int(Status.HIDDEN))
 MAX_ITERATIONS = wp.constant(int(Status.MAX_ITERATIONS))
 MISSING = wp.constant(local_map.TEXEL_MISSING)
+KEY = "local maps"
 PLANE_STEPS = wp.constant(3)  # from texel to texel; walls settle in one or two
 CANDIDATES_PER_MAP = 2  # maps that are looked at for each that is blended, where more than two are
 
@@ -96,35 +98,56 @@ def plan_notes(scene: Scene, reflector, settings: Settings) -> list[Note]:
 def prepare(scene: Scene, reflector, settings: Settings) -> Prepared:
     """Build the mirror's local map; the scene's reference maps are drawn at first use."""
     part = reflector.part
-    references = reference_maps.reference_maps(scene, settings)
-    centre = centre_of(scene, part)
-    start = perf_counter()
-    intersect = intersect_still(scene, part, centre, settings.threads)
-    mesh = local_map.trace_depth_mesh(
-        settings.environment_resolution,
-        intersect,
-        settings.mesh_cells,
-        settings.depth_ratio,
-        scene.device,
-        settings.threads,
-    )
-    traced = perf_counter()
-    rems = nearest_maps(references, centre, settings.rem_count)
-    local, state, statistics = local_map.blend_local_map(
-        scene, centre, mesh, intersect, references.maps, rems, settings
-    )
-    blended = perf_counter()
+    made = _still_map(scene, part, settings)
     movers = moving_in(scene, part)
-    if movers and settings.environment_update != "previous":
-        onward = onward_of(scene, settings)
-        local, state, moved = local_movers.draw_moving(scene, local, state, movers, onward, settings)
-        statistics |= moved
-    drawn = perf_counter()
-    timings = {"local_rays": traced - start, "local_blend": blended - traced, "local_moving": drawn - blended}
-    beyond = _beyond(scene, part, references.placement.centres, references.reach)
+    beyond = _beyond(scene, part, made.references.placement.centres, made.references.reach)
     scene.notes += [note for note in beyond if note not in scene.notes]
-    timings = {name: 1e3 * seconds for name, seconds in timings.items()}
-    return Prepared(part, centre, references, local, state, mesh.cells, movers, mesh.statistics | statistics, timings)
+    if not movers or settings.environment_update == "previous":
+        return replace(made, movers=movers)
+    start = perf_counter()
+
+    def onward(parts: set[int]) -> Onward | None:
+        return _onward_of_still_maps(scene, parts, settings)
+
+    local, state, moved = local_movers.draw_moving(scene, made.local, made.state, movers, onward, settings)
+    timings = made.timings | {"local_moving": 1e3 * (perf_counter() - start)}
+    return replace(made, local=local, state=state, movers=movers, statistics=made.statistics | moved, timings=timings)
+
+
+def _still_map(scene: Scene, part: int, settings: Settings) -> Prepared:
+    """A mirror's local map of what stands still, built at first use and kept with the scene."""
+    key = (KEY, part, settings)
+    if key not in scene.environments:
+        references = reference_maps.reference_maps(scene, settings)
+        centre = centre_of(scene, part)
+        start = perf_counter()
+        intersect = intersect_still(scene, part, centre, settings.threads)
+        mesh = local_map.trace_depth_mesh(
+            settings.environment_resolution,
+            intersect,
+            settings.mesh_cells,
+            settings.depth_ratio,
+            scene.device,
+            settings.threads,
+        )
+        traced = perf_counter()
+        rems = nearest_maps(references, centre, settings.rem_count)
+        made = local_map.blend_local_map(scene, centre, mesh, intersect, references.maps, rems, settings)
+        local, state, statistics = made
+        timings = {"local_rays": 1e3 * (traced - start), "local_blend": 1e3 * (perf_counter() - traced)}
+        statistics = mesh.statistics | statistics
+        scene.environments[key] = Prepared(part, centre, references, local, state, mesh.cells, (), statistics, timings)
+    return scene.environments[key]
+
+
+def _onward_of_still_maps(scene: Scene, parts: set[int], settings: Settings) -> Onward | None:
+    """What mirrors among some parts show: their local maps of what stands still."""
+    mirrors = [k for k in parts if mirror_weight(scene, scene.parts[k], settings)]
+    if settings.bounces <= 1 or not mirrors:
+        return None
+    from warp_reflect.techniques import mirror_maps
+
+    return mirror_maps.of_maps(scene, {k: _still_map(scene, k, settings).local for k in mirrors}, settings.threads)
 
 
 def intersect_still(scene: Scene, part: int, centre: np.ndarray, threads: int) -> local_map.Intersect:
@@ -297,8 +320,8 @@ def reflect(
     settled = wp.zeros(pixels.count, dtype=wp.uint8, device=scene.device)
     local, state, statistics = prepared.local, prepared.state, prepared.statistics
     if prepared.movers and settings.environment_update == "previous":
-        onward = onward_of(scene, settings, history)
-        local, state, moved = local_movers.draw_moving(scene, local, state, prepared.movers, onward, settings)
+        onward = onward_of(scene, prepared.part, settings, history)
+        local, state, moved = local_movers.draw_moving(scene, local, state, prepared.movers, lambda _: onward, settings)
         statistics = statistics | moved
     inputs = [scene.view, scene.lights, local.view, state, settings.parallax_steps, pixels.point, pixels.direction]
     inputs += [layer.triangle, layer.u, layer.v, layer.distance, layer.status, layer.radiance, settled]

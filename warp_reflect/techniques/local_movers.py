@@ -1,12 +1,13 @@
 """What moves, drawn into a mirror's local map in a second pass: reference maps hold nothing of it.
 
 Source: Meyer and Loscos 2003, section 6, where people walk through the reconstructed maps. Differs from it by: other moving
-mirrors are drawn as well, and show their own maps of the frame before (`mirror_maps.of_previous_frame`) where that is asked
-for.
+mirrors are drawn as well, and show their own maps: those of what stands still, or those of the frame before
+(`environment_update` "previous").
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,7 +59,7 @@ def draw_moving(
     local: CubeMaps,
     state: wp.array,
     parts: tuple[int, ...],
-    onward: Onward | None,
+    onward: Callable[[set[int]], Onward | None],
     settings: Settings,
 ) -> tuple[CubeMaps, wp.array, dict[str, int]]:
     """A local map with parts that move in front of what it holds.
@@ -68,7 +69,7 @@ def draw_moving(
         local: A map of all else; it is not changed.
         state: Of its texels, see `local_map.blend_local_map`.
         parts: What is drawn, see `moving_in`.
-        onward: What mirrors among them show; None: the domes.
+        onward: For the parts that are seen, what mirrors among them show; None: the domes.
         settings: `threads`, shadows.
 
     Returns:
@@ -94,7 +95,9 @@ def draw_moving(
     if len(shown):
         made.view.distance = wp.array(distance, dtype=float, device=device)
         made.view.triangle = wp.array(triangle, dtype=int, device=device)
-        local_map.shade_texels(scene, made, shown, settings, onward)
+        patches = np.unique(scene.host_triangle_patch[triangle[shown]])
+        seen = {part for part in parts if np.isin(patches, list(scene.parts[part].patches)).any()}
+        local_map.shade_texels(scene, made, shown, settings, onward(seen))
         of_state[shown] = local_map.TEXEL_SHADED
     return made, wp.array(of_state, dtype=wp.uint8, device=device), {"local_moving": len(shown)}
 

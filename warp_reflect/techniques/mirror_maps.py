@@ -90,6 +90,11 @@ def of_depth(scene: Scene, settings: Settings, depth: int) -> Onward:
     return _onward(scene, [(part, scene.environments[key], k) for k, part in enumerate(parts)], settings.threads)
 
 
+def of_maps(scene: Scene, known: Mapping[int, CubeMaps], threads: int = 0) -> Onward:
+    """What mirrors in maps show: the first map of each part that is named; others show the domes."""
+    return _onward(scene, [(part, maps, 0) for part, maps in known.items()], threads)
+
+
 def of_previous_frame(scene: Scene, before: Mapping[int, object]) -> Onward:
     """What mirrors in maps show: what they showed in the frame before, by reflector id; others show the domes."""
     return _onward(scene, [(shown.part, shown.maps.at(scene), shown.number) for shown in before.values()], 0)
