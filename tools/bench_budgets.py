@@ -117,7 +117,7 @@ def second_frame(scene, view, pivot, size, settings, method="auto"):
 def told(frame) -> dict:
     """Time and error of a frame, predicted and realised."""
     predicted = frame.plan.predicted
-    reflect = sum(row.predicted["ms"] for row in frame.plan.rows) * frame.plan.pace
+    reflect = sum(frame.plan.reflecting("ms").values())
     came_out = realised_error(frame)
     return {
         "techniques": ", ".join(sorted({row.technique for row in frame.plan.rows if row.pixels})),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
@@ -27,17 +28,74 @@ KNOBS = {
 WRONG_MAX = 0.04
 
 
+VIEW = "view"  # among the paces: all that no choice changes
+# By what a pace changes at most from one frame to the next, one of which may have been disturbed; and at first.
+PACE_STEP, FIRST_STEP = 2.0, 8.0
+PACE_WEIGHT = 0.7  # of the last frame in a pace, as an exponent
+
+
+@dataclass(frozen=True)
+class Spent:
+    """How long a frame took, without preparation.
+
+    Attributes:
+        view_ms: For the eye's view and the shading.
+        reflect_ms: For what mirrors reflect.
+        cold: It started from nothing.
+    """
+
+    view_ms: float
+    reflect_ms: float
+    cold: bool = False
+
+    @property
+    def ms(self) -> float:
+        return self.view_ms + self.reflect_ms
+
+
+@dataclass(frozen=True)
+class Pace:
+    """Milliseconds that took place for one that was predicted: for the view, and for each technique that was tried.
+
+    What was tried and left again is remembered: that keeps a request for a time from swinging between two choices.
+    """
+
+    known: dict[str, float] = field(default_factory=dict)
+
+    def of(self, what: str) -> float:
+        """Of a technique or `VIEW`; of what was never tried, the geometric mean of all that was."""
+        if what in self.known or not self.known:
+            return self.known.get(what, 1.0)
+        return math.exp(sum(math.log(each) for each in self.known.values()) / len(self.known))
+
+    def learnt(self, taken: dict[str, float], expected: dict[str, float]) -> Pace:
+        """After another frame.
+
+        Args:
+            taken, expected: Milliseconds by technique or `VIEW`, expected at this pace; what is 0 teaches nothing.
+        """
+        known = dict(self.known)
+        for what in taken:
+            if min(taken[what], expected[what]) > 0.0:
+                first = what not in self.known
+                step = FIRST_STEP if first else PACE_STEP
+                ratio = min(max(taken[what] / expected[what], 1.0 / step), step)
+                known[what] = self.of(what) * ratio ** (1.0 if first else PACE_WEIGHT)
+        return Pace(known)
+
+
 @dataclass(frozen=True)
 class Option:
-    """One way to reflect a mirror, and what it is predicted to cost and to err."""
+    """One way to reflect a mirror, and what it is predicted to cost, at a technique's pace, and to err."""
 
     technique: str
     settings: Settings
     predicted: dict
+    pace: float = 1.0
 
     @property
     def ms(self) -> float:
-        return self.predicted["ms"]
+        return self.pace * self.predicted["ms"]
 
     @property
     def loss(self) -> float:
@@ -101,7 +159,6 @@ def choose(
     fixed_ms: float,
     max_error_px: float = 0.0,
     budget_ms: float = 0.0,
-    pace: float = 1.0,
 ) -> Choice:
     """The cheapest options that hold an error, or the most accurate that fit a time.
 
@@ -115,18 +172,17 @@ def choose(
         fixed_ms: Of a frame, whatever is chosen.
         max_error_px: At the 95th percentile; 0: not asked for. [pixels]
         budget_ms: Of a whole frame, without preparation; 0: not asked for.
-        pace: Milliseconds that take place for one that is predicted.
     """
     if max_error_px > 0.0:
         chosen = _holding(fronts, max_error_px)
-        total = pace * (fixed_ms + sum(option.ms for option in chosen.options.values()))
+        total = fixed_ms + sum(option.ms for option in chosen.options.values())
         if 0.0 < budget_ms < total:
             chosen.notes.append(
                 f"budget_ms={budget_ms:g} gave way: the cheapest that holds max_error_px={max_error_px:g} takes "
                 f"{total:.3g} ms (predicted)"
             )
         return chosen
-    return _affordable(fronts, pixels, fixed_ms, budget_ms, pace)
+    return _affordable(fronts, pixels, fixed_ms, budget_ms)
 
 
 def _holding(fronts: dict[int, list[Option]], max_error_px: float) -> Choice:
@@ -146,17 +202,17 @@ def _holding(fronts: dict[int, list[Option]], max_error_px: float) -> Choice:
     return chosen
 
 
-def _affordable(fronts, pixels, fixed_ms: float, budget_ms: float, pace: float) -> Choice:
+def _affordable(fronts, pixels, fixed_ms: float, budget_ms: float) -> Choice:
     place = dict.fromkeys(fronts, 0)
 
     def total() -> float:
-        return pace * (fixed_ms + sum(front[place[k]].ms for k, front in fronts.items()))
+        return fixed_ms + sum(front[place[k]].ms for k, front in fronts.items())
 
     notes = []
     if total() > budget_ms:
         notes.append(
             f"budget_ms={budget_ms:g} cannot be met: the cheapest takes {total():.3g} ms (predicted), "
-            f"{pace * fixed_ms:.3g} of them for the eye's view and the shading"
+            f"{fixed_ms:.3g} of them for the eye's view and the shading"
         )
     while True:
         left = budget_ms - total()
@@ -164,7 +220,7 @@ def _affordable(fronts, pixels, fixed_ms: float, budget_ms: float, pace: float) 
         for reflector, front in fronts.items():
             now = front[place[reflector]]
             for further in range(place[reflector] + 1, len(front)):
-                price = pace * (front[further].ms - now.ms)
+                price = front[further].ms - now.ms
                 if price <= left:
                     worth = pixels[reflector] * (now.loss - front[further].loss) / max(price, 1.0e-9)
                     steps.append((worth, -reflector, further))

@@ -12,6 +12,7 @@ import warp as wp
 
 from warp_reflect import __version__, bounces, images, motion, raster, shade, surface, transmission, waves
 from warp_reflect.channels import CHANNELS, POINTS, component_of, known_names, reflection_channels
+from warp_reflect.choice import Spent
 from warp_reflect.effects import FINISHES, PANE_FINISHES, finish_of, moves_with_time
 from warp_reflect.layers import NO_REFLECTOR, Camera, GBuffer, MirrorPixels, ReflectionLayer, add_statistics
 from warp_reflect.planner import Plan, PlanRow, find_camera, keep_pace
@@ -64,7 +65,14 @@ class Frame:
     @property
     def spent_ms(self) -> float:
         """Milliseconds of the frame's steps, without preparation."""
-        return sum(ms for step, ms in self.timings.items() if "/" not in step and step != "prepare")
+        return self.spent.ms
+
+    @property
+    def spent(self) -> Spent:
+        """The same in parts."""
+        outermost = {step: ms for step, ms in self.timings.items() if "/" not in step and step != "prepare"}
+        reflect = outermost.pop("reflect", 0.0)
+        return Spent(sum(outermost.values()), reflect, self._before is None)
 
     @property
     def expected_ms(self) -> float:
@@ -233,7 +241,7 @@ def render_frame(scene: Scene, plan: Plan, camera: str | Camera | None = None, p
     timer = StageTimer(scene.device)
     plan = plan.at(scene)
     if previous is not None and not previous.kept:
-        plan = keep_pace(plan, previous.plan, previous.spent_ms, previous.expected_ms)
+        plan = keep_pace(plan, previous.plan, previous.spent)
     settings = plan.settings
     view = plan.camera if camera is None else find_camera(scene, camera, plan.size)
     gbuffer, layers = reflect_scene(scene, plan, view, timer, previous)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 from warp_reflect import __version__, applicable, calibration, choice, raster, transmission, vector
 from warp_reflect.applicable import PREFERRED
-from warp_reflect.budget import BUILT_IN, Costs, fixed_ms, predict
+from warp_reflect.budget import BUILT_IN, Costs, fixed_ms, loss, predict
 from warp_reflect.effects import Effect, bounce_effect, finish_effects, pane_effects
 from warp_reflect.launch import thread_count
 from warp_reflect.layers import Camera, Reflector
@@ -25,11 +25,10 @@ METHODS = ("auto", "reference", "none")
 OF_ALL_TIMES = ("layered_environment",)  # prepare something that holds nothing that moves
 REUSING = ("quadric", "reflector_map")  # know a bound on how far a virtual vertex drifts
 DEFAULT_SIZE = (960, 540)  # usdrecord's default width at 16:9
-# Of the time asked for: between them a frame's time changes nothing.
-BAND = (0.7, 1.05)
-ROOM = 0.95  # of it: what a dearer choice may be predicted to take
-PACE_STEP = 2.0  # by which a pace changes at most from one frame to the next: one frame may have been disturbed
-PACE_WEIGHT = 0.7  # of the last frame in the pace, as an exponent
+# Of a time asked for: a frame that takes more is late, and what is dearer may be predicted to take as much; between them a
+# choice stands.
+LATE, ROOM = 1.05, 0.95
+BETTER = 0.8  # of the error: what a dearer choice has to come down to, else the last one stands
 
 
 @dataclass(frozen=True)
@@ -93,7 +92,7 @@ class Plan:
         notes: What the user should know about the plan, beside the scene's own notes.
         lights: One `LightRow` per light of the stage.
         costs: What the machine's steps cost.
-        pace: Milliseconds that took place for one that was predicted, learnt where a time is asked for.
+        pace: How long things took for what was predicted of them, learnt where a time is asked for.
     """
 
     scene: Scene
@@ -105,9 +104,10 @@ class Plan:
     notes: list[Note]
     lights: list[LightRow] = field(default_factory=list)
     costs: Costs = BUILT_IN
-    pace: float = 1.0
+    pace: choice.Pace = field(default_factory=choice.Pace)
     _prepared: dict[int, object] = field(default_factory=dict)
-    _fronts: dict[int, list[choice.Option]] = field(default_factory=dict)
+    _ways: dict[int, list[choice.Option]] = field(default_factory=dict)
+    _told: int = 0  # of the notes, the last: those of the request for an error or a time
 
     @property
     def fixed_ms(self) -> float:
@@ -126,12 +126,25 @@ class Plan:
     @property
     def predicted(self) -> dict[str, float]:
         """Of a whole frame, without preparation: `ms` among others, `first_ms` from nothing, `error_px` of its worst mirror."""
-        numbers = [row.predicted for row in self.rows]
+        view = self.pace.of(choice.VIEW) * self.fixed_ms
         return {
-            "ms": self.pace * (self.fixed_ms + sum(each["ms"] for each in numbers)),
-            "first_ms": self.pace * (self.fixed_ms + sum(each["first_ms"] for each in numbers)),
-            "error_px": max((each["error_px"] for each in numbers), default=0.0),
+            "ms": view + sum(self.reflecting("ms").values()),
+            "first_ms": view + sum(self.reflecting("first_ms").values()),
+            "error_px": max((row.predicted["error_px"] for row in self.rows), default=0.0),
         }
+
+    @property
+    def loss(self) -> float:
+        """One number for the error of a frame, to compare plans by."""
+        return sum(row.pixels * loss(row.predicted) for row in self.rows)
+
+    def reflecting(self, key: str) -> dict[str, float]:
+        """Predicted milliseconds of every technique, at its pace."""
+        spent: dict[str, float] = {}
+        for row in self.rows:
+            ms = self.pace.of(row.technique) * row.predicted[key]
+            spent[row.technique] = spent.get(row.technique, 0.0) + ms
+        return spent
 
     @property
     def size(self) -> tuple[int, int]:
@@ -241,36 +254,39 @@ def _name(row: PlanRow | PaneRow) -> str:
     return row.path + (f"[{row.instance}]" if row.instance else "") + (f":{row.subset}" if row.subset else "")
 
 
-def keep_pace(plan: Plan, before: Plan, spent_ms: float, expected_ms: float) -> Plan:
+def keep_pace(plan: Plan, before: Plan, spent: choice.Spent) -> Plan:
     """The plan of the next frame of an animation, for a request for a time, from how long the last frame took.
 
-    Within a dead band about the time asked for the last choice stands, so that quality does not flicker; outside of it the
-    pace is learnt and the choice is made again. What is dearer is taken only where it leaves some room.
+    Every frame teaches the pace. A choice is left for a cheaper one only after a frame that was late, and for a dearer one
+    only where that is predicted to leave room and to err clearly less: so quality does not flicker.
 
     Args:
         plan: Of the next frame.
         before: Of the last one.
-        spent_ms: It took, without preparation.
-        expected_ms: Was predicted for it, at its pace.
+        spent: On it.
     """
     budget = plan.settings.budget_ms
-    if budget <= 0.0 or expected_ms <= 0.0 or (before.settings, before.method) != (plan.settings, plan.method):
+    if budget <= 0.0 or (before.settings, before.method) != (plan.settings, plan.method):
         return plan
-    within = BAND[0] * budget <= spent_ms <= BAND[1] * budget
-    ratio = min(max(spent_ms / expected_ms, 1.0 / PACE_STEP), PACE_STEP)
-    if within:
-        if before.scene is plan.scene and before.camera is plan.camera:
-            return before
-        made = dataclasses.replace(plan, rows=list(plan.rows), notes=[], _prepared={})
-        _fit(made, before.pace, keep=before)
-    else:
-        made = dataclasses.replace(plan, rows=list(plan.rows), notes=[], _prepared={})
-        _fit(made, before.pace * ratio**PACE_WEIGHT)
-        if made.predicted["ms"] > ROOM * budget and spent_ms < budget:
-            _fit(made, made.pace, keep=before)
+    pace = before.pace.learnt(*_compared(before, spent))
+    stays, free = (dataclasses.replace(plan, rows=list(plan.rows), notes=list(plan.notes), _prepared={}) for _ in "12")
+    _fit(stays, pace, keep=before)
+    free._ways = stays._ways
+    _fit(free, pace)
+    late = spent.ms > LATE * budget
+    dearer = free.predicted["ms"] <= ROOM * budget and free.loss < BETTER * stays.loss
+    made = free if late or dearer else stays
     for earlier in (plan, before):
         _take_over(made, earlier)
     return made
+
+
+def _compared(before: Plan, spent: choice.Spent) -> tuple[dict[str, float], dict[str, float]]:
+    """(milliseconds taken, expected) by technique and `choice.VIEW`; techniques of one frame share its time as predicted."""
+    reflecting = before.reflecting("first_ms" if spent.cold else "ms")
+    ratio = spent.reflect_ms / max(sum(reflecting.values()), 1.0e-9)
+    expected = reflecting | {choice.VIEW: before.pace.of(choice.VIEW) * before.fixed_ms}
+    return {name: ratio * ms for name, ms in reflecting.items()} | {choice.VIEW: spent.view_ms}, expected
 
 
 def make_plan(
@@ -327,7 +343,7 @@ def make_plan(
     if settings.kernels != "plain" and not scene.device.is_cuda and vector.missing():
         notes.append(Note("", f"plain kernels only: {vector.missing()} (kernels={settings.kernels})"))
     made = Plan(scene, view, settings, method, rows, panes, notes, lights, costs)
-    _fit(made, 1.0 if earlier is None else earlier.pace)
+    _fit(made, choice.Pace() if earlier is None else earlier.pace)
     _take_over(made, earlier)
     return made
 
@@ -529,33 +545,36 @@ def _cheapest(scene, reflector, camera, pixels, settings, costs) -> tuple[str, b
     return name, False, reason
 
 
-def _fit(made: Plan, pace: float, keep: Plan | None = None) -> None:
+def _fit(made: Plan, pace: choice.Pace, keep: Plan | None = None) -> None:
     """Choose techniques and settings anew where the user asks for an error or a time.
 
     Args:
         made: Changed in place.
-        pace: Milliseconds that take place for one that is predicted.
+        pace: What is known of how long things take.
         keep: A plan of the same request whose choice stands, where it is one of this plan's.
     """
     settings, scene = made.settings, made.scene
     if made.method == "reference" or not (settings.max_error_px > 0.0 or settings.budget_ms > 0.0):
         return
     rows = {row.reflector.id: row for row in made.rows if row.pixels >= max(settings.few_pixels, 1)}
-    if not made._fronts:
-        made._fronts = {id: choice.frontier(_options(made, row)) for id, row in rows.items()}
-    tiny = sum(row.predicted["ms"] for row in made.rows if row.reflector.id not in rows)
+    if not made._ways:
+        made._ways = {id: _options(made, row) for id, row in rows.items()}
+    ways = {
+        id: [dataclasses.replace(option, pace=pace.of(option.technique)) for option in options]
+        for id, options in made._ways.items()
+    }
+    tiny = sum(pace.of(row.technique) * row.predicted["ms"] for row in made.rows if row.reflector.id not in rows)
     chosen = choice.choose(
-        made._fronts,
+        {id: choice.frontier(options) for id, options in ways.items()},
         {id: row.pixels for id, row in rows.items()},
-        made.fixed_ms + tiny,
+        pace.of(choice.VIEW) * made.fixed_ms + tiny,
         settings.max_error_px,
         settings.budget_ms,
-        pace,
     )
     if keep is not None:
         before = {row.reflector.id: (row.technique, row.settings) for row in keep.rows}
-        for id, front in made._fronts.items():
-            same = next((each for each in front if (each.technique, each.settings) == before.get(id)), None)
+        for id, options in ways.items():
+            same = next((each for each in options if (each.technique, each.settings) == before.get(id)), None)
             chosen.options[id] = same or chosen.options[id]
     for k, row in enumerate(made.rows):
         option = chosen.options.get(row.reflector.id)
@@ -563,7 +582,8 @@ def _fit(made: Plan, pace: float, keep: Plan | None = None) -> None:
             continue
         reason = chosen.reasons[row.reflector.id]
         made.rows[k] = _changed(made, row, option.technique, option.settings, reason, option.predicted)
-    made.notes += [Note(scene.data.source, text) for text in chosen.notes]
+    kept = made.notes[: len(made.notes) - made._told]
+    made.notes, made._told = kept + [Note(scene.data.source, text) for text in chosen.notes], len(chosen.notes)
     made.pace = pace
 
 
