@@ -374,7 +374,7 @@ def _look_through(
 ) -> dict[int, transmission.Transmission]:
     """Add to a picture what the eye sees through transparent surfaces; it, by the surfaces' parts."""
     settings, shown, interfaces = plan.settings, through.shown, through.interfaces
-    pixels = transmission.seen_parts(scene, shown.gbuffer, [pane.part for pane in plan.panes])
+    pixels = surface.seen_parts(scene, shown.gbuffer, [pane.part for pane in plan.panes])
     transmitted = {}
     for pane in plan.panes:
         if pane.part not in pixels:

@@ -6,7 +6,7 @@ normal, or for a gprim the analytic surface behind the facet, met by the eye ray
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 import warp as wp
@@ -329,6 +329,18 @@ def mirror_pixels(
         )
         result[reflector] = mirror
     return result, reflector_id
+
+
+def seen_parts(scene: Scene, gbuffer: GBuffer, parts: Iterable[int]) -> dict[int, np.ndarray]:
+    """Ascending int32 numbers of the pixels at which the eye sees each of some parts; nothing of one that is not seen."""
+    part_of_patch = np.full(max(len(scene.patch_shapes), 1), -1)
+    for part in parts:
+        part_of_patch[list(scene.parts[part].patches)] = part
+    # The background is triangle -1: the last entry.
+    part_of_triangle = np.append(part_of_patch[scene.host_triangle_patch], -1)
+    shown = part_of_triangle[gbuffer.triangle.numpy()]
+    found = {part: np.flatnonzero(shown == part).astype(np.int32) for part in sorted(parts)}
+    return {part: pixel for part, pixel in found.items() if len(pixel)}
 
 
 def _pixels_by_reflector(reflector_id: np.ndarray, parts: Mapping[int, int]) -> dict[int, np.ndarray]:

@@ -19,7 +19,7 @@ it by: e^(-distance / length) in place of linear fog, so that two distances in a
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -140,10 +140,12 @@ class Interfaces:
 
     Attributes:
         views: `InterfaceView` of every patch.
+        clear: bool [patches], whether anything is seen through one.
         fades: Whether what is behind any of them fades.
     """
 
     views: wp.array
+    clear: np.ndarray
     fades: bool
 
 
@@ -154,19 +156,21 @@ def make_interfaces(scene: Scene, finishes: Mapping[int, FinishData]) -> Interfa
         scene: The scene.
         finishes: Transparent part to what is asked of it; one that is not to be frosted has frost 0.
     """
-    views = [InterfaceView() for _ in scene.patch_shapes]
+    opaque = InterfaceView()
+    views = [opaque] * len(scene.patch_shapes)
     for index, finish in finishes.items():
         kind, _ = interface_of(scene, index)
         part = scene.parts[index]
         for patch in part.patches:
-            view = views[patch]
+            view = views[patch] = InterfaceView()
             view.kind = KINDS.index(kind)
             view.ior = scene.data.materials[part.material].ior
             view.spread = math.tan(math.radians(finish.frost))
             view.fade = 1.0 / finish.frost_distance if finish.frost_distance > 0.0 else 0.0
             view.fade_color = wp.vec3(*finish.frost_color)
     fades = any(finish.frost_distance > 0.0 for finish in finishes.values())
-    return Interfaces(wp.array(views, dtype=InterfaceView, device=scene.device), fades)
+    clear = np.array([view is not opaque for view in views], bool)
+    return Interfaces(wp.array(views, dtype=InterfaceView, device=scene.device), clear, fades)
 
 
 @wp.func
@@ -307,6 +311,15 @@ def cross_seen_kernel(
     out_weight[i] = crossing.weight
 
 
+@wp.func
+def fade_share(veil: InterfaceView, triangle: int, distance: float) -> float:
+    """What is left of what is seen at a distance behind a surface; nothing of the sky."""
+    share = float(1.0)
+    if veil.fade > 0.0:
+        share = wp.where(triangle >= 0, wp.exp(-distance * veil.fade), 0.0)
+    return share
+
+
 @wp.kernel
 def cross_hits_kernel(
     first: int,
@@ -341,9 +354,7 @@ def cross_hits_kernel(
     if fading.shape[0] > 0 and fading[i] >= 0:
         # The patch that the ray came through last.
         veil = interfaces[fading[i]]
-        share = float(1.0)
-        if veil.fade > 0.0:
-            share = wp.where(tri >= 0, wp.exp(-distance[i] * veil.fade), 0.0)
+        share = fade_share(veil, tri, distance[i])
         out_faded[i] = (1.0 - share) * wp.cw_mul(left, veil.fade_color)
         left = share * left
         out_fading[i] = fading[i]
@@ -439,6 +450,30 @@ def mean_nearness_kernel(first: int, nearness: wp.array(dtype=wp.vec2), out_near
 
 
 @wp.kernel
+def met_kernel(
+    first: int,
+    interfaces: wp.array(dtype=InterfaceView),
+    fading: wp.array(dtype=int),
+    triangle: wp.array(dtype=int),
+    distance: wp.array(dtype=float),
+    seen: wp.array(dtype=wp.vec3),
+    # Outputs:
+    out_total: wp.array(dtype=wp.vec3),
+    out_nearness: wp.array(dtype=float),
+):
+    """One thread per ray that has met something opaque or nothing: it, faded, and how near it is."""
+    i = first + wp.tid()
+    if fading.shape[0] > 0:
+        veil = interfaces[fading[i]]
+        share = fade_share(veil, triangle[i], distance[i])
+        out_total[i] = share * seen[i] + (1.0 - share) * veil.fade_color
+    if out_nearness.shape[0] > 0:
+        out_nearness[i] = 0.0
+        if triangle[i] >= 0 and distance[i] > 0.0:
+            out_nearness[i] = 1.0 / distance[i]
+
+
+@wp.kernel
 def transmitted_term_kernel(
     first: int,
     pixel: wp.array(dtype=int),
@@ -450,18 +485,6 @@ def transmitted_term_kernel(
     i = first + wp.tid()
     term = wp.cw_mul(weight[i], radiance[i])
     out_picture[pixel[i]] += wp.vec4(term[0], term[1], term[2], 0.0)
-
-
-def seen_parts(scene: Scene, gbuffer: GBuffer, parts: Iterable[int]) -> dict[int, np.ndarray]:
-    """Ascending int32 numbers of the pixels at which the eye sees each of some parts; nothing of one that is not seen."""
-    triangle = gbuffer.triangle.numpy()
-    shown = np.full(len(triangle), -1)
-    part_of_patch = np.full(max(len(scene.patch_shapes), 1), -1)
-    for part in parts:
-        part_of_patch[list(scene.parts[part].patches)] = part
-    shown[triangle >= 0] = part_of_patch[scene.host_triangle_patch[triangle[triangle >= 0]]]
-    found = {part: np.flatnonzero(shown == part).astype(np.int32) for part in sorted(parts)}
-    return {part: pixel for part, pixel in found.items() if len(pixel)}
 
 
 def look_through(
@@ -479,7 +502,7 @@ def look_through(
         scene: On the G-buffer's device.
         shown: What the eye sees.
         interfaces: From `make_interfaces`.
-        pixel: Of one surface, from `seen_parts`.
+        pixel: Of one surface, from `surface.seen_parts`.
         settings: Threads.
         sample: (k, n): ray k of n of the cone into which a frosted surface scatters; (0, 0): its middle.
         wavy: Rays are bent at the normals of `shown`, waves included; otherwise only those that leave a body are.
@@ -541,6 +564,15 @@ def behind(
     """
     device, threads = scene.device, settings.threads
     count = layer.pixels.count
+    if not _meets_transparent(scene, interfaces, layer):
+        if patches is None and nearness is None:
+            return seen
+        total = wp.empty(count, dtype=wp.vec3, device=device) if patches is not None else seen
+        near = wp.empty(0, dtype=float, device=device) if nearness is None else nearness
+        given = patches if patches is not None else wp.empty(0, dtype=int, device=device)
+        inputs = [interfaces.views, given, layer.triangle, layer.distance, seen]
+        launch.launch(met_kernel, count, [*inputs, total, near], device, threads)
+        return total
     index = np.arange(count, dtype=np.int32)
     weight = wp.full(count, wp.vec3(1.0, 1.0, 1.0), dtype=wp.vec3, device=device)
     fading = wp.full(count if interfaces.fades else 0, -1, dtype=int, device=device)
@@ -597,6 +629,11 @@ def behind(
     if near is not None:
         launch.launch(mean_nearness_kernel, count, [near, nearness], device, threads)
     return total
+
+
+def _meets_transparent(scene: Scene, interfaces: Interfaces, layer: ReflectionLayer) -> bool:
+    triangle = layer.triangle.numpy()
+    return bool(interfaces.clear[scene.host_triangle_patch[triangle[triangle >= 0]]].any())
 
 
 def _count(layer: ReflectionLayer, **numbers: int) -> None:

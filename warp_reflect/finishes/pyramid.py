@@ -17,7 +17,7 @@ class Pyramid:
 
     Attributes:
         color: Radiance and coverage, multiplied by the latter; picture by picture, level by level.
-        nearness: 1 / distance from the surface at level 0 of the first picture, multiplied by the coverage.
+        nearness: 1 / distance from the surface at level 0 of the first picture.
         first: Texel at which each level starts.
         texels: Of one picture.
     """
@@ -31,14 +31,6 @@ class Pyramid:
     width: int
     height: int
     levels: int
-
-
-@wp.struct
-class Texel:
-    """A look-up: radiance and nearness times the coverage, and that."""
-
-    color: wp.vec4
-    nearness: float
 
 
 @wp.func
@@ -61,22 +53,39 @@ def level_of(pyramid: Pyramid, width: float) -> int:
 
 
 @wp.func
-def look_up(pyramid: Pyramid, x: float, y: float) -> Texel:
-    """Bilinear look-up in the first picture at a pixel coordinate relative to the bounds; nothing beyond them."""
-    sx = x - 0.5
-    sy = y - 0.5
-    x0 = int(wp.floor(sx))
-    y0 = int(wp.floor(sy))
-    found = Texel()
-    for k in range(4):
-        tx = x0 + k % 2
-        ty = y0 + k // 2
-        if tx >= 0 and ty >= 0 and tx < pyramid.width and ty < pyramid.height:
-            share = (1.0 - wp.abs(sx - float(tx))) * (1.0 - wp.abs(sy - float(ty)))
-            texel = ty * pyramid.width + tx
-            found.color += share * pyramid.color[texel]
-            found.nearness += share * pyramid.nearness[texel]
-    return found
+def texel_at(pyramid: Pyramid, x: int, y: int) -> wp.vec4:
+    """A texel of the first picture; nothing beyond the bounds."""
+    texel = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    if x >= 0 and y >= 0 and x < pyramid.width and y < pyramid.height:
+        texel = pyramid.color[y * pyramid.width + x]
+    return texel
+
+
+@wp.func
+def look_up(pyramid: Pyramid, x: float, y: float) -> wp.vec4:
+    """Bilinear look-up of the first picture's colour at a pixel coordinate relative to the bounds."""
+    left = wp.floor(x - 0.5)
+    top = wp.floor(y - 0.5)
+    right_share = x - 0.5 - left
+    bottom_share = y - 0.5 - top
+    tx = int(left)
+    ty = int(top)
+    upper = (1.0 - right_share) * texel_at(pyramid, tx, ty) + right_share * texel_at(pyramid, tx + 1, ty)
+    lower = (1.0 - right_share) * texel_at(pyramid, tx, ty + 1) + right_share * texel_at(pyramid, tx + 1, ty + 1)
+    return (1.0 - bottom_share) * upper + bottom_share * lower
+
+
+@wp.func
+def nearness_at(pyramid: Pyramid, x: float, y: float, otherwise: float) -> float:
+    """Nearness of the first picture's nearest texel; `otherwise` where the surface is not seen there."""
+    tx = int(wp.floor(x))
+    ty = int(wp.floor(y))
+    result = otherwise
+    if tx >= 0 and ty >= 0 and tx < pyramid.width and ty < pyramid.height:
+        texel = ty * pyramid.width + tx
+        if pyramid.color[texel][3] > 0.0:
+            result = pyramid.nearness[texel]
+    return result
 
 
 @wp.func

@@ -16,7 +16,7 @@ from __future__ import annotations
 import warp as wp
 
 from warp_reflect import bvh, launch, shade
-from warp_reflect.finishes.pyramid import Pyramid, look_up, make_picture
+from warp_reflect.finishes.pyramid import Pyramid, look_up, make_picture, nearness_at
 from warp_reflect.layers import CameraView, MirrorPixels, ReflectionLayer
 from warp_reflect.optics import refract
 from warp_reflect.scene import Scene, SceneView
@@ -26,8 +26,9 @@ from warp_reflect.transmission import Through, Transmission, look_through, throu
 
 wp.set_module_options({"enable_backward": False})
 
-SEARCH_STEPS = wp.constant(3)
-SNELL_STEPS = wp.constant(4)  # Newton's, from the still picture's own point: waves move it by little
+# Look-ups for the height of what a turned ray meets: more change few pixels.
+MIRROR_STEPS = wp.constant(3)
+REFRACTION_STEPS = wp.constant(2)
 RETREATS = wp.constant(4)  # halvings of a shift that leaves the surface
 LEAST_NEARNESS = wp.constant(1.0e-6)  # of the eye's own: what is further is as good as infinitely far
 LEAST_DEPTH = wp.constant(1.0e-6)
@@ -51,8 +52,8 @@ def shifted_radiance(pyramid: Pyramid, own: wp.vec2, at: wp.vec2, otherwise: wp.
     shift = at - own
     for _step in range(RETREATS):
         found = look_up(pyramid, own[0] + shift[0], own[1] + shift[1])
-        if found.color[3] >= EVEN_COVERAGE:
-            return wp.vec3(found.color[0], found.color[1], found.color[2]) / found.color[3]
+        if found[3] >= EVEN_COVERAGE:
+            return wp.vec3(found[0], found[1], found[2]) / found[3]
         shift = 0.5 * shift
     return otherwise
 
@@ -116,42 +117,40 @@ def reflect_waves_kernel(
     near = nearness[i]
     rise = wp.dot(turned, n)
     at = own
-    for _step in range(SEARCH_STEPS):
+    for _step in range(MIRROR_STEPS):
         at = seen_at(camera, to_point + behind / wp.max(near * rise, least), own)
-        found = look_up(pyramid, at[0] - corner[0], at[1] - corner[1])
-        if found.color[3] >= EVEN_COVERAGE:
-            near = found.nearness / found.color[3]
+        near = nearness_at(pyramid, at[0] - corner[0], at[1] - corner[1], near)
     out_radiance[i] = shifted_radiance(pyramid, own - corner, at - corner, radiance[i])
 
 
 @wp.func
-def crossing_point(to_point: wp.vec3, n: wp.vec3, target: wp.vec3, ior: float) -> wp.vec3:
+def crossing_point(near_it: wp.vec3, n: wp.vec3, target: wp.vec3, ior: float) -> wp.vec3:
     """Where an eye at the origin sees a point behind a flat interface: the point of the interface on its way.
 
     Args:
-        to_point: A point of the interface near it.
+        near_it: A point of the interface near it.
         n: Unit normal on the eye's side.
         target: The point behind.
         ior: Index of refraction behind the interface over that before it.
     """
-    height = -wp.dot(to_point, n)
-    depth = wp.max(-wp.dot(target - to_point, n), 0.0)
+    height = -wp.dot(near_it, n)
+    depth = wp.max(-wp.dot(target - near_it, n), 0.0)
     across = target - wp.dot(target, n) * n
     length = wp.length(across)
     if not (length > 0.0):
         return -height * n
-    s = wp.clamp(wp.length(to_point + height * n), 0.0, length)
-    for _step in range(SNELL_STEPS):
-        left = length - s
-        before = wp.sqrt(s * s + height * height)
-        after = wp.sqrt(left * left + depth * depth)
-        if not (before > 0.0 and after > 0.0):
-            break
-        residual = s / before - ior * left / after
-        slope = height * height / (before * before * before) + ior * depth * depth / (after * after * after)
-        if not (slope > 0.0):
-            break
-        s = wp.clamp(s - residual / slope, 0.0, length)
+    s = wp.clamp(wp.length(near_it + height * n), 0.0, length)
+    # One step of Newton's: waves move the point by little, and the search comes here again.
+    left = length - s
+    before = s * s + height * height
+    after = left * left + depth * depth
+    if before > 0.0 and after > 0.0:
+        before = 1.0 / wp.sqrt(before)
+        after = 1.0 / wp.sqrt(after)
+        residual = s * before - ior * left * after
+        slope = height * height * before * before * before + ior * depth * depth * after * after * after
+        if slope > 0.0:
+            s = wp.clamp(s - residual / slope, 0.0, length)
     return (s / length) * across - height * n
 
 
@@ -191,20 +190,22 @@ def refract_waves_kernel(
     if not (wp.dot(bent, n) < 0.0):
         return
     bent = unit(bent)
-    still = refract(incident, n, ior)
+    still = wp.vec3(0.0, 0.0, 0.0)
+    if camera.orthographic != 0:
+        still = refract(incident, n, ior)
     least = LEAST_NEARNESS / wp.max(wp.length(to_point), LEAST_DEPTH)
     near = nearness[i]
     at = own
-    for _step in range(SEARCH_STEPS):
+    crossing = to_point
+    for _step in range(REFRACTION_STEPS):
         target = to_point - bent / wp.min(near * wp.dot(bent, n), -least)
         if camera.orthographic == 0:
-            at = seen_at(camera, crossing_point(to_point, n, target, ior), own)
+            crossing = crossing_point(crossing, n, target, ior)
+            at = seen_at(camera, crossing, own)
         else:
             way = wp.dot(target - to_point, n) / wp.dot(still, n)
             at = seen_at(camera, target - way * still, own)
-        found = look_up(pyramid, at[0] - corner[0], at[1] - corner[1])
-        if found.color[3] >= EVEN_COVERAGE:
-            near = found.nearness / found.color[3]
+        near = nearness_at(pyramid, at[0] - corner[0], at[1] - corner[1], near)
     out_radiance[i] = shifted_radiance(pyramid, own - corner, at - corner, radiance[i])
 
 
