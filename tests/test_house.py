@@ -24,7 +24,7 @@ FLOORS = {
     "grid_rays occupancy voxels "
     "images metrics timing clipping",
     2: "scene reflectors environment_maps baked_maps segments layers bvh raster raster_vector shade shade_vector surface "
-    "pictures textures "
+    "surface_vector pictures textures "
     "normal_maps bounces direct shadows transmission waves channels stage stage.* scene_field "
     "baked_environments",
     3: "solve solver solve_device solve_plane solve_convex solve_map solve_general solve_qim solver_gradients mirrors "

@@ -8,8 +8,8 @@ import warp as wp
 from rooms import CHROME, placed, plane_room, room, sphere, square
 
 import warp_reflect as wr
-from warp_reflect import vector
-from warp_reflect.layers import CameraView
+from warp_reflect import raster, surface, vector
+from warp_reflect.layers import Camera, CameraView
 from warp_reflect.raster import make_target, rasterise
 from warp_reflect.scene import CameraData, InstanceData, LightData, MaterialData, Scene, SceneData
 
@@ -222,3 +222,19 @@ def test_every_surface_is_shaded_as_the_plain_kernels_do(kind, projection, shado
         # Sums of some twenty products each: 16 units in the last place.
         np.testing.assert_allclose(vectors[channel], plain[channel], rtol=16 * 2.0**-23, atol=1e-6, err_msg=channel)
         np.testing.assert_array_equal(frames["vector", 2][channel], vectors[channel], err_msg=channel)
+
+
+@pytest.mark.parametrize("projection", ["perspective", "orthographic"])
+def test_mirrors_are_met_bit_for_bit_where_the_plain_kernel_meets_them(projection):
+    """An analytic ball, a plane, smooth and torn facets, each a mirror, silhouettes included."""
+    scene = lit_room([], projection)
+    gbuffer = raster.draw_scene(scene, Camera.from_data(scene.data.cameras[0], (173, 101)))
+    parts = {part + 1: part for part in range(len(scene.parts))}
+    plain, _ = surface.mirror_pixels(scene, gbuffer, parts, 1, "plain")
+    assert sum(mirror.count > 50 for mirror in plain.values()) >= 5
+    for threads in (1, 2):
+        vectors, _ = surface.mirror_pixels(scene, gbuffer, parts, threads, "vector")
+        for number, mirror in plain.items():
+            for name in ("pixel", "point", "normal", "direction"):
+                got, want = getattr(vectors[number], name).numpy(), getattr(mirror, name).numpy()
+                np.testing.assert_array_equal(got, want, err_msg=f"{name} of {number}")

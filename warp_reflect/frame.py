@@ -413,7 +413,9 @@ def _look(scene: Scene, plan: Plan, view: Camera, timer: StageTimer) -> tuple[GB
     with timer("raster"):
         gbuffer = raster.draw_scene(scene, view, threads, kernels=plan.settings.kernels)
     with timer("mirror_pixels"):
-        pixels, gbuffer.reflector_id = surface.mirror_pixels(scene, gbuffer, _mirrors(plan), threads)
+        pixels, gbuffer.reflector_id = surface.mirror_pixels(
+            scene, gbuffer, _mirrors(plan), threads, plan.settings.kernels
+        )
     return gbuffer, pixels
 
 

@@ -24,30 +24,6 @@ _SHADING = r"""
     const int count = triangle.shape[0];
     const int begin = block * BLOCK;
     const int end = begin + BLOCK < count ? begin + BLOCK : count;
-    auto times = [](F s, V a) -> V { return V{s * a.x, s * a.y, s * a.z}; };
-    auto product = [](V a, V b) -> V { return V{a.x * b.x, a.y * b.y, a.z * b.z}; };
-    auto vpick = [](I mask, V a, V b) -> V { return V{mask ? a.x : b.x, mask ? a.y : b.y, mask ? a.z : b.z}; };
-    auto same = [](float s) -> V { return V{F(s), F(s), F(s)}; };
-    auto grey = [](F s) -> V { return V{s, s, s}; };
-    auto spread = [](const auto& a) -> V { return V{F(a[0]), F(a[1]), F(a[2])}; };
-    auto size = [fmax](V a) -> F {
-        return fmax(fmax(__builtin_elementwise_abs(a.x), __builtin_elementwise_abs(a.y)), __builtin_elementwise_abs(a.z));
-    };
-    auto clip = [fmin, fmax](F a, float low, float high) -> F { return fmin(fmax(a, F(low)), F(high)); };
-    // shapes.unit
-    auto unit = [&](V a) -> V {
-        const F square = dot(a, a);
-        const I safe = (square > 1.0e-24f) & (square < 1.0e24f);
-        V result = times(1.0f / __builtin_elementwise_sqrt(square), a);
-        if (bits(~safe)) {
-            const F m = size(a);
-            const F inverse = 1.0f / m;
-            const V s = times(inverse, a);
-            const V scaled = times(1.0f / __builtin_elementwise_sqrt(dot(s, s)), s);
-            result = vpick(safe, result, vpick(m == 0.0f, same(0.0f), scaled));
-        }
-        return result;
-    };
     // shade.dome_radiance
     auto dome_radiance = [&](I mask, V d) -> V {
         const F slope = dot(spread(lights.sky_slope), d);
@@ -116,13 +92,8 @@ _SHADING = r"""
     // What lanes `seen` of points `own` on triangles `tri` give back along unit rays: base radiance and weight of the mirror
     // term, whose direction is left in `onward`. `weights` gives u and v, and is asked only where they matter.
     auto lit = [&](I seen, I own, I tri, V ray, I reflector, auto weights, V& onward) -> Lit {
-        F corner[8], corner_z;
-        const I at = 12 * tri;
-        gather8(records.data, at, corner);
-        EACH_LANE corner_z[l] = records.data[at[l] + 8];
-        const V p0 = V{corner[0], corner[1], corner[2]};
-        const V p1 = V{corner[3], corner[4], corner[5]};
-        const V p2 = V{corner[6], corner[7], corner_z};
+        V p0, p1, p2;
+        corners(records.data, tri, p0, p1, p2);
         const I patch = igather(scene.triangle_patch.data, tri);
         // One patch for all lanes, or for each its own.
         const bool alone = !bits(patch != patch[0]);
@@ -150,21 +121,7 @@ _SHADING = r"""
         const F w = 1.0f - u - v;
 
         // surface.hit_normal
-        V n;
-        {
-            const V e1 = sub(p1, p0), e2 = sub(p2, p0);
-            n = cross(e1, e2);
-            const F square = dot(n, n);
-            const I safe = (square > 1.0e-24f) & (square < 1.0e24f);
-            if (bits(~safe)) {
-                const F m = fmax(size(e1), size(e2));
-                const F inverse = 1.0f / m;
-                const V scaled = unit(cross(times(inverse, e1), times(inverse, e2)));
-                n = vpick(safe, times(1.0f / __builtin_elementwise_sqrt(square), n), vpick(m == 0.0f, same(0.0f), scaled));
-            } else {
-                n = times(1.0f / __builtin_elementwise_sqrt(square), n);
-            }
-        }
+        V n = facet_normal(p0, p1, p2);
         if (bits(seen & smooth)) {
             const I i0 = ipick(smooth, first_normal, I(0));
             const I i1 = ipick(smooth, igather(normal_index, 3 * tri + 1), I(0));

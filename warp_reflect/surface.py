@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 import warp as wp
 
-from warp_reflect import launch
+from warp_reflect import launch, vector
 from warp_reflect.layers import CameraView, GBuffer, MirrorPixels, eye_ray_direction, eye_ray_origin, pixel_bounds
 from warp_reflect.scene import SHAPE_PLANE, SHAPE_QUADRIC, Scene, SceneView
 from warp_reflect.shapes import clamp_weights, facet_normal, intersect_triangle, max_abs, unit
@@ -238,6 +238,29 @@ def reflector_id_kernel(
     out_reflector[i] = reflector
 
 
+@wp.func
+def mirror_pixel(
+    scene: SceneView,
+    camera: CameraView,
+    triangle: wp.array(dtype=int),
+    depth_key: wp.array(dtype=float),
+    p: int,
+    i: int,
+    out_point: wp.array(dtype=wp.vec3),
+    out_normal: wp.array(dtype=wp.vec3),
+    out_direction: wp.array(dtype=wp.vec3),
+):
+    """The surface at pixel p of the picture and its reflected direction, into entry i."""
+    row = p // camera.width
+    x = float(p - row * camera.width) + 0.5
+    s = surface_at(scene, camera, triangle[p], depth_key[p], x, float(row) + 0.5)
+    out_point[i] = s.p_scene
+    out_normal[i] = s.normal
+    d = s.incident - 2.0 * wp.dot(s.incident, s.normal) * s.normal
+    # Distances count in its length, which is 1 up to rounding: one Newton step of 1 / sqrt restores it.
+    out_direction[i] = (1.5 - 0.5 * wp.dot(d, d)) * d
+
+
 @wp.kernel
 def mirror_pixels_kernel(
     first: int,
@@ -252,19 +275,11 @@ def mirror_pixels_kernel(
 ):
     """One thread per mirror pixel."""
     i = first + wp.tid()
-    p = pixel[i]
-    row = p // camera.width
-    x = float(p - row * camera.width) + 0.5
-    s = surface_at(scene, camera, triangle[p], depth_key[p], x, float(row) + 0.5)
-    out_point[i] = s.p_scene
-    out_normal[i] = s.normal
-    d = s.incident - 2.0 * wp.dot(s.incident, s.normal) * s.normal
-    # Distances count in its length, which is 1 up to rounding: one Newton step of 1 / sqrt restores it.
-    out_direction[i] = (1.5 - 0.5 * wp.dot(d, d)) * d
+    mirror_pixel(scene, camera, triangle, depth_key, pixel[i], i, out_point, out_normal, out_direction)
 
 
 def mirror_pixels(
-    scene: Scene, gbuffer: GBuffer, parts: Mapping[int, int], threads: int = 0
+    scene: Scene, gbuffer: GBuffer, parts: Mapping[int, int], threads: int = 0, kernels: str = "auto"
 ) -> tuple[dict[int, MirrorPixels], wp.array]:
     """The pixels of every reflector with their points, normals and reflected directions.
 
@@ -273,6 +288,7 @@ def mirror_pixels(
         gbuffer: What the eye sees.
         parts: Reflector id (1-based) to the index of its part in `scene.parts`.
         threads: CPU threads; 0: one per core.
+        kernels: `Settings.kernels`.
 
     Returns:
         (`MirrorPixels` per id, of length 0 where a reflector is not seen; reflector id per pixel, int32
@@ -311,22 +327,15 @@ def mirror_pixels(
             direction=wp.empty(n, dtype=wp.vec3, device=device),
             box=pixel_bounds(pixel, width),
         )
-        launch.launch(
-            mirror_pixels_kernel,
-            n,
-            [
-                scene.view,
-                gbuffer.view,
-                gbuffer.triangle,
-                gbuffer.depth_key,
-                mirror.pixel,
-                mirror.point,
-                mirror.normal,
-                mirror.direction,
-            ],
-            device,
-            threads,
-        )
+        seen = [gbuffer.view, gbuffer.triangle, gbuffer.depth_key, mirror.pixel]
+        outputs = [mirror.point, mirror.normal, mirror.direction]
+        if vector.chosen(kernels, device):
+            from warp_reflect import surface_vector  # which reflects at this module's surface
+
+            inputs = [scene.view, scene.triangle_records, *seen, *outputs]
+            vector.launch_blocks(surface_vector.mirror_blocks_kernel, n, inputs, device, threads)
+        else:
+            launch.launch(mirror_pixels_kernel, n, [scene.view, *seen, *outputs], device, threads)
         result[reflector] = mirror
     return result, reflector_id
 

@@ -54,6 +54,45 @@ _HEAD = r"""
     auto cross = [](V a, V b) -> V {
         return V{a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
     };
+    auto times = [](F s, V a) -> V { return V{s * a.x, s * a.y, s * a.z}; };
+    auto product = [](V a, V b) -> V { return V{a.x * b.x, a.y * b.y, a.z * b.z}; };
+    auto vpick = [](I mask, V a, V b) -> V { return V{mask ? a.x : b.x, mask ? a.y : b.y, mask ? a.z : b.z}; };
+    auto same = [](float s) -> V { return V{F(s), F(s), F(s)}; };
+    auto grey = [](F s) -> V { return V{s, s, s}; };
+    auto spread = [](const auto& a) -> V { return V{F(a[0]), F(a[1]), F(a[2])}; };
+    auto size = [fmax](V a) -> F {
+        return fmax(fmax(__builtin_elementwise_abs(a.x), __builtin_elementwise_abs(a.y)), __builtin_elementwise_abs(a.z));
+    };
+    auto clip = [fmin, fmax](F a, float low, float high) -> F { return fmin(fmax(a, F(low)), F(high)); };
+    // shapes.unit
+    auto unit = [&](V a) -> V {
+        const F square = dot(a, a);
+        const I safe = (square > 1.0e-24f) & (square < 1.0e24f);
+        V result = times(1.0f / __builtin_elementwise_sqrt(square), a);
+        if (bits(~safe)) {
+            const F m = size(a);
+            const F inverse = 1.0f / m;
+            const V s = times(inverse, a);
+            const V scaled = times(1.0f / __builtin_elementwise_sqrt(dot(s, s)), s);
+            result = vpick(safe, result, vpick(m == 0.0f, same(0.0f), scaled));
+        }
+        return result;
+    };
+    // shapes.facet_normal
+    auto facet_normal = [&](V p0, V p1, V p2) -> V {
+        const V e1 = sub(p1, p0), e2 = sub(p2, p0);
+        const V n = cross(e1, e2);
+        const F square = dot(n, n);
+        const I safe = (square > 1.0e-24f) & (square < 1.0e24f);
+        V result = times(1.0f / __builtin_elementwise_sqrt(square), n);
+        if (bits(~safe)) {
+            const F m = fmax(size(e1), size(e2));
+            const F inverse = 1.0f / m;
+            const V scaled = unit(cross(times(inverse, e1), times(inverse, e2)));
+            result = vpick(safe, result, vpick(m == 0.0f, same(0.0f), scaled));
+        }
+        return result;
+    };
     auto load = [](const float* p) -> F { F v; __builtin_memcpy(&v, p, sizeof(v)); return v; };
     auto iload = [](const int* p) -> I { I v; __builtin_memcpy(&v, p, sizeof(v)); return v; };
     auto store = [](float* p, F v) { __builtin_memcpy(p, &v, sizeof(v)); };
@@ -115,14 +154,25 @@ _HEAD = r"""
         }
         return v;
     };
+    // Corners of triangles, from `Scene.triangle_records`.
+    auto corners = [gather8](const float* records, I triangle, V& p0, V& p1, V& p2) {
+        F corner[8], corner_z;
+        const I at = 12 * triangle;
+        gather8(records, at, corner);
+        EACH_LANE corner_z[l] = records[at[l] + 8];
+        p0 = V{corner[0], corner[1], corner[2]};
+        p1 = V{corner[3], corner[4], corner[5]};
+        p2 = V{corner[6], corner[7], corner_z};
+    };
     (void)bits; (void)lanes; (void)pick; (void)ipick; (void)fmin; (void)fmax; (void)sub; (void)add; (void)dot; (void)cross;
     (void)load; (void)iload; (void)store; (void)istore; (void)gather; (void)igather; (void)vgather; (void)halves; (void)gather8;
+    (void)product; (void)vpick; (void)same; (void)grey; (void)spread; (void)clip; (void)unit; (void)corners; (void)facet_normal;
 """
 
 
-def snippet(body: str) -> str:
-    """The text of a native function: `body` after the shared head on a CPU, nothing for CUDA (where it is never launched)."""
-    return "#if !defined(__CUDACC_RTC__) && !defined(__CUDA_ARCH__)\n" + _HEAD + body + "\n#endif\n"
+def snippet(body: str, elsewhere: str = "") -> str:
+    """The text of a native function: `body` after the shared head on a CPU, `elsewhere` for CUDA (never launched there)."""
+    return f"#if !defined(__CUDACC_RTC__) && !defined(__CUDA_ARCH__)\n{_HEAD}{body}\n#else\n{elsewhere}\n#endif\n"
 
 
 def block_count(count: int) -> int:
