@@ -12,6 +12,9 @@ from warp_reflect import raster, surface, vector
 from warp_reflect.layers import Camera, CameraView
 from warp_reflect.raster import make_target, rasterise
 from warp_reflect.scene import CameraData, InstanceData, LightData, MaterialData, Scene, SceneData
+from warp_reflect.techniques import quadric_patch
+from warp_reflect.techniques.quadric_search import QuadricView
+from warp_reflect.techniques.vertices import SolveFrame, empty_vertices
 
 wp.set_module_options({"enable_backward": False})
 CPU = wp.get_device("cpu")
@@ -238,3 +241,65 @@ def test_mirrors_are_met_bit_for_bit_where_the_plain_kernel_meets_them(projectio
             for name in ("pixel", "point", "normal", "direction"):
                 got, want = getattr(vectors[number], name).numpy(), getattr(mirror, name).numpy()
                 np.testing.assert_array_equal(got, want, err_msg=f"{name} of {number}")
+
+
+# (lam, b, c) in the unit frame, family 0 about a centre, 1 a bowl, 2 a sheet; eye outside.
+BODIES = {
+    "sphere": ((1.0, 1.0, 1.0), 0.0, -1.0, 0),
+    "needle": ((1.0, 900.0, 400.0), 0.0, -1.0, 0),
+    "cylinder": ((1.0, 1.0, 0.0), 0.0, -1.0, 0),
+    "bowl": ((1.0, 0.5, 0.0), -0.5, 0.1, 1),
+    "sheet": ((1.0, 2.0, -1.0), 0.0, 0.5, 2),
+}
+
+
+def searched(body, points, eye, kernels, threads=1, seeds=None):
+    """VertexView of points in the unit frame, as `quadric_patch.reflect` has them solved."""
+    lam, b, c, family = body
+    quadric = QuadricView()
+    quadric.lam, quadric.b, quadric.c, quadric.family = wp.vec3(*lam), b, c, family
+    frame = SolveFrame()
+    frame.unit_from_scene = frame.eye_from_unit = wp.mat33(np.eye(3, dtype=np.float32))
+    frame.eye = wp.vec3(*eye)
+    camera = CameraView()
+    forward = -np.float64(eye) / np.linalg.norm(eye)
+    camera.forward, camera.near, camera.far = wp.vec3(*forward), 1e-3, 1e3
+    camera.x_row, camera.y_row = wp.vec4(300.0, 0.0, 20.0, 0.0), wp.vec4(0.0, 280.0, -30.0, 0.0)
+    out = empty_vertices(len(points), CPU, with_position=True)
+    if seeds is not None:
+        out.seed.assign(seeds)
+    array = wp.array(points, dtype=wp.vec3, device=CPU)
+    quadric_patch.search(array, [3, 2], quadric, frame, camera, seeds is not None, out, CPU, threads, kernels)
+    return {name: getattr(out, name).numpy() for name in ("status", "screen", "seed", "residual", "reach", "position")}
+
+
+def hard_points(body, eye):
+    """Around, on and in the body, far, tiny distances apart, on the line of sight, at the eye, grazing."""
+    rng = np.random.default_rng(11)
+    turned = rng.normal(size=(900, 3))
+    turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+    near = turned * rng.uniform(0.2, 3.0, (900, 1))
+    far = turned[:60] * 10.0 ** rng.uniform(1, 6, (60, 1))
+    sight = np.float64(eye) * np.linspace(-3.0, 1.5, 40)[:, None]
+    skin = near[:200] * (1.0 + 10.0 ** rng.uniform(-7, -2, (200, 1)))
+    special = [eye, (0, 0, 0), (0, 0, 1), (1, 0, 0), (0, 0, -1e-6), (1e-30, 0, 2)]
+    return np.concatenate([near, far, sight, skin, special]).astype(np.float32)
+
+
+@pytest.mark.parametrize("name", BODIES)
+def test_reflection_points_are_searched_as_the_plain_kernel_does(name):
+    body, eye = BODIES[name], (2.5, 1.2, 1.7 if name != "sheet" else 0.9)
+    points = hard_points(body, eye)
+    cold = searched(body, points, eye, "plain")
+    assert {1, 3} <= set(cold["status"].tolist()) and (cold["status"] == 1).sum() > 300
+    # Seeds that are right, far off, and missing.
+    seeds = cold["seed"] * np.random.default_rng(2).choice([0.0, 1.0, 1.0, 0.7], (len(points), 1)).astype(np.float32)
+    for start in (None, seeds):
+        plain = searched(body, points, eye, "plain", seeds=start)
+        vectors = searched(body, points, eye, "vector", seeds=start)
+        np.testing.assert_array_equal(vectors["status"], plain["status"])
+        for field in ("screen", "seed", "residual", "reach", "position"):
+            # Sums are taken in the plain kernel's order.
+            np.testing.assert_array_equal(vectors[field], plain[field], err_msg=field)
+        for field, values in searched(body, points, eye, "vector", threads=2, seeds=start).items():
+            np.testing.assert_array_equal(values, vectors[field], err_msg=field)

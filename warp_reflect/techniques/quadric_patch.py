@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from warp_reflect import bvh
+from warp_reflect import bvh, vector
 from warp_reflect.launch import launch
 from warp_reflect.layers import Camera, CameraView, GBuffer, MirrorPixels, ReflectionLayer, Reflector
 from warp_reflect.quadrics import FAMILY, CanonicalQuadric, Family
 from warp_reflect.scene import Scene
 from warp_reflect.settings import Settings, Technique
-from warp_reflect.techniques import forward
+from warp_reflect.techniques import forward, quadric_vector
 from warp_reflect.techniques.quadric_search import QuadricView, is_visible, solve_vertex
 from warp_reflect.techniques.vertices import SolveFrame, VertexView
 
@@ -44,6 +44,33 @@ def search_kernel(
     if warm != 0:
         seed = out_vertex.seed[i]
     solve_vertex(quadric, frame, camera, target, seed, i, out_vertex)
+
+
+def search(
+    points: wp.array,
+    own: list[int],
+    quadric: QuadricView,
+    frame: SolveFrame,
+    camera: CameraView,
+    warm: bool,
+    out_vertex: VertexView,
+    device,
+    threads: int,
+    kernels: str,
+) -> None:
+    """Solve every vertex that has no status yet.
+
+    Args:
+        points: vec3 [n], scene frame.
+        own: [first, count] of the vertices that have no picture.
+        warm: Start from `out_vertex.seed` where it is not zero.
+        kernels: `Settings.kernels`.
+    """
+    inputs = [points, *own, quadric, frame, camera, int(warm), out_vertex]
+    cone = quadric.family == int(Family.SHEET) and quadric.c == 0.0
+    if not cone and vector.chosen(kernels, device):
+        vector.launch_blocks(quadric_vector.search_blocks_kernel, len(points), inputs, device, threads)
+    launch(search_kernel, len(points), inputs, device, threads)
 
 
 @wp.kernel
@@ -157,8 +184,8 @@ def reflect(
 
     def solve_vertices(points, has_own: bool, frame: SolveFrame, warm: bool, out_vertex: VertexView) -> None:
         own = forward.own_vertices(part) if has_own else [0, 0]
-        inputs = [points, *own, view, frame, gbuffer.view, int(warm), out_vertex]
-        launch(search_kernel, len(points), inputs, scene.device, settings.threads)
+        sort = settings.kernels
+        search(points, own, view, frame, gbuffer.view, warm, out_vertex, scene.device, settings.threads, sort)
 
     def solve_boundary(points, frame: SolveFrame, edges: wp.array, out_point: wp.array) -> None:
         steps = forward.BOUNDARY_STEPS[settings.refine]
