@@ -9,12 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from panes import HALF, SIZE, WATER, balls, frame, shown_places, stage, upright, with_finish
+from panes import HALF, SIZE, WATER, balls, eye_rays, floor_error_px, frame, shown_places, stage, upright, with_finish
 from rooms import CHROME, placed, sphere, square
 
 import warp_reflect as wr
 from warp_reflect import raster, waves
-from warp_reflect.scene import MaterialData, Scene
+from warp_reflect.images import write_exr
+from warp_reflect.scene import MaterialData, Scene, TextureRef
 
 WAVY = with_finish(WATER, wave_slope=0.05, wave_length=1.0, wave_speed=1.0)
 POOL = square(1, 20.0), placed(0, 0, -3)
@@ -78,6 +79,46 @@ def test_the_refracted_picture_is_looked_up_where_the_bent_rays_lead():
     assert mask.sum() > 8000 and moved.mean() > 1.0
     assert off.mean() < 0.05 * moved.mean()
     assert np.quantile(off, 0.95) < 0.25
+
+
+@pytest.mark.parametrize("mode", ["lookup", "traced"])
+def test_a_normal_map_bends_what_is_seen_through_water(mode, tmp_path):
+    """One that is tilted everywhere: as the rays through a surface with that normal, in float64."""
+    tilt = np.array([0.06, -0.04, 1.0])  # along u, v and the surface's normal
+    tilt /= np.linalg.norm(tilt)
+    write_exr(tmp_path / "n.exr", {"RGB": np.tile(np.float32(0.5 * tilt + 0.5), (4, 4, 1))}, half=())
+    signed = {"color_space": "signed", "scale": (2.0, 2.0, 2.0, 1.0), "bias": (-1.0, -1.0, -1.0, 0.0)}
+    pool = square(1, 20.0)
+    pool.uvs, pool.uv_index = np.float32(pool.points[:, [0, 2]] * [1.0, -1.0]), pool.triangles
+    mapped = dataclasses.replace(WATER, textures={"normal": TextureRef(str(tmp_path / "n.exr"), **signed)})
+    size = (320, 180)
+    shown = frame(stage((pool, placed(0, 0, -3), mapped)), size, waves=mode)
+    eye, d = eye_rays(shown.camera)
+    p = eye + (-eye[1] / d[..., 1])[..., None] * d
+    n = np.array([tilt[0], tilt[2], -tilt[1]])
+    across = (d - (d @ n)[..., None] * n) / 1.333
+    bent = across - np.sqrt(1.0 - np.sum(across**2, -1, keepdims=True)) * n
+    place = (p + (-1.0 / bent[..., 1])[..., None] * bent)[..., [0, 2]]
+    mask = np.zeros(size[::-1], bool)
+    mask[110:160, 40:-40] = True
+    mask &= (np.abs(place[..., 0]) < HALF - 0.1) & (np.abs(place[..., 1] + 3.0) < HALF - 0.1)
+    direct = shown["RGBA"][..., :3] - shown["reflection"]
+    assert "normal map" in shown.plan.panes[0].effects["waves"].reason and mask.sum() > 5000
+    assert np.quantile(floor_error_px(direct, place, mask), 0.95) < 0.1
+
+
+@pytest.mark.parametrize("stored", ["missing", "zero"])
+def test_a_normal_map_that_says_nothing_leaves_the_water_still(stored, tmp_path):
+    if stored == "zero":
+        write_exr(tmp_path / "n.exr", {"RGB": np.full((4, 4, 3), 0.5, np.float32)}, half=())
+    signed = {"color_space": "signed", "scale": (2.0, 2.0, 2.0, 1.0), "bias": (-1.0, -1.0, -1.0, 0.0)}
+    pool = square(1, 20.0)
+    pool.uvs, pool.uv_index = np.float32(pool.points[:, [0, 2]]), pool.triangles
+    mapped = dataclasses.replace(WATER, textures={"normal": TextureRef(str(tmp_path / "n.exr"), **signed)})
+    scene = stage((pool, placed(0, 0, -3), mapped))
+    shown, still = frame(scene), frame(stage((pool, placed(0, 0, -3), WATER)))
+    np.testing.assert_allclose(shown["RGBA"], still["RGBA"], atol=1e-3)
+    assert any("n.exr" in note.text or "no direction" in note.text for note in scene.notes)
 
 
 def test_look_ups_stay_on_the_water_at_a_shore_and_of_what_is_above_it():

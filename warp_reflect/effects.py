@@ -124,6 +124,10 @@ def pane_effects(
     waves = _waves(scene, part, finish, settings)
     if waves.on and interface != "solid":
         waves = Effect(False, "a thin surface bends nothing, still or wavy", waves.numbers)
+    elif not waves.on and interface == "solid" and "normal" in material.textures and settings.waves != "off":
+        flat, why = planar.is_flat(scene, part)
+        mapped = f"its normal map bends what is seen through it, waves={settings.waves}"
+        waves = Effect(flat, mapped if flat else f"normal maps bend rays on flat surfaces only; {why}", waves.numbers)
     return {
         "transparency": Effect(True, f"opacity {material.opacity:g}, {seen}, {depth}", numbers),
         "refraction": Effect(interface == "solid", reason, {"ior": material.ior}),

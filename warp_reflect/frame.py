@@ -15,7 +15,7 @@ from warp_reflect.channels import CHANNELS, POINTS, component_of, known_names, r
 from warp_reflect.choice import Spent
 from warp_reflect.effects import FINISHES, PANE_FINISHES, finish_of, moves_with_time
 from warp_reflect.layers import NO_REFLECTOR, Camera, GBuffer, MirrorPixels, ReflectionLayer, add_statistics
-from warp_reflect.planner import Plan, PlanRow, find_camera, keep_pace
+from warp_reflect.planner import PaneRow, Plan, PlanRow, find_camera, keep_pace
 from warp_reflect.scene import Scene
 from warp_reflect.settings import Technique
 from warp_reflect.techniques import MAPS, TECHNIQUES
@@ -326,7 +326,7 @@ def _shown(
     bumpy = [row.reflector.id for row in plan.rows if row.effects["normal_map"].on]
     shown = shade.look(scene, gbuffer, threads, plan.shadows, bumpy, plan.settings.kernels)
     surfaces = [*((row.reflector.part, row) for row in plan.rows), *((pane.part, pane) for pane in plan.panes)]
-    wavy = {part: row.settings for part, row in surfaces if row.effects["waves"].on}
+    wavy = {part: row.settings for part, row in surfaces if _has_waves(row)}
     if wavy:
         asked = {k: finish_of(scene.data.materials[scene.parts[k].material], each) for k, each in wavy.items()}
         normals = waves.wave_normals(scene, gbuffer, shown.normals, asked, threads)
@@ -367,6 +367,12 @@ def _met(scene: Scene, plan: Plan, shown: shade.Shown, interfaces: transmission.
         return bounces.onward(scene, shown.gbuffer, bodies, layer, radiance, reflected, follow, settings.threads)
 
     return met
+
+
+def _has_waves(row: PlanRow | PaneRow) -> bool:
+    """Not where it is a normal map alone that bends what is seen through a surface."""
+    effect = row.effects["waves"]
+    return effect.on and effect.numbers.get("slope", 0.0) > 0.0
 
 
 def _look_through(

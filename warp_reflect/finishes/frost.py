@@ -28,7 +28,8 @@ from warp_reflect.transmission import (
 wp.set_module_options({"enable_backward": False})
 
 LOOK_UPS = 12  # of an octave
-OCTAVES = wp.constant(5)  # of the cone's radius; what is nearer than the last is blurred as that
+OCTAVES = wp.constant(7)  # of the cone's radius; what is nearer than the last is blurred as that
+SHARPEST = wp.constant(0.5)  # pixels: a smaller disc is the pixel itself
 LEAST_COVERAGE = wp.constant(1.0e-3)  # of a cone: below it there is nothing to mix
 
 
@@ -107,13 +108,16 @@ def frost_kernel(
         texel = wp.where(level > 0, float(1 << level), 0.0)
         within = wp.sqrt(wp.max(radius * radius - texel * texel, 0.0))
         total = wp.vec4(0.0, 0.0, 0.0, 0.0)
-        for k in range(count // 2):
-            # The same for every pixel: neighbours differ by what they show only, and nothing is grainy. In pairs about the
-            # pixel: nothing is shifted.
-            disc = within * disc_sample(b, k, count // 2)
-            total += look_up_level(pyramid, b, x + disc[0], y + disc[1], level)
-            total += look_up_level(pyramid, b, x - disc[0], y - disc[1], level)
-        total /= float(2 * (count // 2))
+        if radius < SHARPEST:
+            total = look_up_level(pyramid, b, x, y, 0)
+        else:
+            for k in range(count // 2):
+                # The same for every pixel: neighbours differ by what they show only, and nothing is grainy. In pairs about
+                # the pixel: nothing is shifted.
+                disc = within * disc_sample(b, k, count // 2)
+                total += look_up_level(pyramid, b, x + disc[0], y + disc[1], level)
+                total += look_up_level(pyramid, b, x - disc[0], y - disc[1], level)
+            total /= float(2 * (count // 2))
         if total[3] > LEAST_COVERAGE:
             taken = wp.min(total[3], left)
             mixed += (taken / total[3]) * wp.vec3(total[0], total[1], total[2])
