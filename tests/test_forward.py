@@ -4,10 +4,11 @@ import dataclasses
 
 import numpy as np
 import pytest
-from rooms import identical, placed, plane_room, render, room, sphere
+from rooms import CHROME, identical, placed, plane_room, render, room, sphere, square
 
 import warp_reflect as wr
 from warp_reflect.layers import Camera
+from warp_reflect.scene import CameraData, InstanceData, MaterialData, Scene, SceneData
 from warp_reflect.settings import Status
 from warp_reflect.techniques import virtual_mesh
 
@@ -103,3 +104,18 @@ def test_unknown_channel_lists_the_known(ball_room):
     with pytest.raises(KeyError, match="pathLength"):
         frame["depth"]
     assert frame["N.X"].shape == (18, 32) and frame["RGBA"].shape == (18, 32, 4)
+
+
+@pytest.mark.parametrize("method", ["quadric", "reflector_map"])
+def test_floors_of_few_large_triangles_are_whole(method):
+    """Two triangles a hundred times as large as the mirror, partly hidden by it, and a strip closely above them."""
+    floor, strip = square(1, 60.0), square(1, 60.0)
+    strip = dataclasses.replace(strip, points=strip.points * np.float32([0.04, 1.0, 1.0]))
+    instances = [InstanceData(0, placed(0.0, 0.0, -1.0, 0.8), "/mirror", (0,))]
+    instances += [InstanceData(1, placed(0.0, -0.9, 0.0), "/floor", (1,))]
+    instances += [InstanceData(2, placed(0.9, -0.88, 0.0), "/strip", (1,))]
+    cameras = [CameraData("/camera", placed(0.3, 0.9, 3.0), near=0.05, focal_length=24.0)]
+    scene = Scene(SceneData("floors", [sphere(), floor, strip], instances, [CHROME, MaterialData()], [], cameras))
+    frames = [render(scene, how, size=(240, 136)) for how in (method, "reference")]
+    assert identical(*frames) >= 0.998
+    assert frames[0].statistics["bvh"] < 0.6 * (frames[0]["reflectorId"] > 0).sum()

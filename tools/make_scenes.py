@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 from pxr import Usd, UsdGeom, UsdValidation, Vt
+from scene_city import CITY_SCENES, LARGE_CITIES
 from scene_curved import CURVED_SCENES
 from scene_parts import STAND_BEAD, STAND_RING
 from scene_sets import WALLS, arena, boxes, corner, play_room, play_things, studio
@@ -36,12 +37,13 @@ def build(name: str, path, scale: float = 1.0) -> Path:
     Raises:
         ValueError: an unknown scene, or a scale that is not above 0.
     """
-    if name not in SCENES:
-        raise ValueError(f"scene: got '{name}', expected one of {', '.join(SCENES)}")
+    recipes = SCENES | LARGE_CITIES
+    if name not in recipes:
+        raise ValueError(f"scene: got '{name}', expected one of {', '.join(recipes)}")
     if not scale > 0.0:
         raise ValueError(f"scale: got {scale!r}, expected a number above 0")
     path = Path(path).absolute()
-    recipe = SCENES[name]
+    recipe = recipes[name]
     folder = "parts" if scale == 1.0 else f"parts_x{scale:g}"
     stage = new_stage(path, "World")
     recipe.make(Writer(stage, Detail(scale), path.suffix, path.parent / folder, f"./{folder}"))
@@ -432,6 +434,7 @@ SCENES = {
     ),
     **CURVED_SCENES,
     **WATER_SCENES,
+    **CITY_SCENES,
 }
 
 
@@ -465,13 +468,18 @@ LARGE_SCALE = 6.0
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", default=Path(__file__).resolve().parent.parent / "usd_scenes", type=Path)
-    parser.add_argument("--only", action="append", choices=sorted(SCENES), help="this scene; may be repeated")
+    parser.add_argument(
+        "--only", action="append", choices=sorted(SCENES | LARGE_CITIES), help="this scene; may be repeated"
+    )
     parser.add_argument("--scale", default=1.0, type=float, help="multiplies the segments of every mesh")
-    parser.add_argument("--large", type=Path, help="also write million-triangle .usdc versions into this folder")
+    parser.add_argument(
+        "--large", type=Path, help="also write million-triangle .usdc versions, and the cities, into this folder"
+    )
     args = parser.parse_args()
     jobs = [(name, args.out / f"{name}.usda", args.scale) for name in args.only or SCENES]
     if args.large:
         jobs += [(name, args.large / f"{name}.usdc", LARGE_SCALE) for name in ("kitchen", "one_mirror")]
+        jobs += [(name, args.large / f"{name}.usdc", 1.0) for name in LARGE_CITIES]
     failed = False
     folders = set()
     for name, path, scale in jobs:

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scene_city_parts import CITY_PARTS
 from scene_shapes import (
     Detail,
     Egg,
@@ -45,6 +46,9 @@ LOOKS = {
     "Chrome": Look((0.9, 0.9, 0.92), 1.0, 0.0),
     "RedMirror": Look((0.85, 0.12, 0.1), 1.0, 0.0),
     "BlueMirror": Look((0.12, 0.2, 0.85), 1.0, 0.0),
+    "PaintRed": Look((0.75, 0.22, 0.18), 1.0, 0.0),
+    "PaintBlue": Look((0.25, 0.4, 0.75), 1.0, 0.0),
+    "PaintGold": Look((0.85, 0.66, 0.3), 1.0, 0.0),
     "Black": Look((0.02, 0.02, 0.022)),
     "White": Look((0.82, 0.81, 0.78)),
     "Cream": Look((0.78, 0.7, 0.55)),
@@ -657,4 +661,5 @@ PARTS: dict[str, Callable[[Detail], Pieces]] = {
     "wall_play": _tiled_wall(8, *["tiles_play"] * 4, *["tiles_peach"] * 4),
     "wall_teal": _tiled_wall(7, *["tiles_teal"] * 4),
     "wall_unit": _wall_unit,
+    **CITY_PARTS,
 }

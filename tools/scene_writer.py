@@ -16,7 +16,7 @@ from scene_shapes import Detail, Surface, weld
 # are not seen; a mirror's own normals turn rays. Finer builds (scale above 1) are not rounded.
 DIGITS = (4, 2)
 MIRROR_DIGITS = (6, 4)
-MIRROR_PARTS = ("kettle", "car_shell")
+MIRROR_PARTS = ("kettle", "car_shell", "city_car")
 
 
 @dataclass

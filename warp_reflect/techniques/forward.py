@@ -331,11 +331,13 @@ def cut_where_bent(
     for _ in range(virtual_mesh.RELAX_STEPS):
         allowed_px = settings.edge_px * relaxed / virtual_mesh.CUT_SLACK
         upper = estimated[ids] if relaxed == 1.0 else cuts_for(relaxed / virtual_mesh.CUT_SLACK)[ids]
-        cuts[ids] = virtual_mesh.measured_cuts(scene, ids, upper, vertices, middles, allowed_px)
+        cuts[ids] = virtual_mesh.measured_cuts(scene, ids, upper, vertices, middles, allowed_px, unit_per_scene)
         if virtual_mesh.triangle_cost(cuts) <= virtual_mesh.budget(scene):
             break
         relaxed *= virtual_mesh.RELAX
     finer = virtual_mesh.cut_mesh(scene, part, cuts, estimated, relaxed)
+    coarse = virtual_mesh.coarse_triangles(scene, part, vertices, ids, middles, cuts, unit_per_scene)
+    finer.coarse = wp.array(coarse, dtype=int, device=scene.device)
     base = mesh.base_count
     known = empty_vertices(finer.vertex_count, scene.device, with_position=len(vertices.position) > 0)
     copy_vertices(known, vertices, base)

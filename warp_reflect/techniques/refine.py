@@ -217,6 +217,35 @@ def settle_kernel(
     out_settled[i] = wp.uint8(wp.where(hit.hops == 0, CANDIDATE, WALK))
 
 
+@wp.kernel
+def coarse_kernel(
+    first: int,
+    scene: SceneView,
+    coarse: wp.array(dtype=int),
+    point: wp.array(dtype=wp.vec3),
+    direction: wp.array(dtype=wp.vec3),
+    triangle: wp.array(dtype=int),
+    distance: wp.array(dtype=float),
+    # Outputs:
+    out_settled: wp.array(dtype=wp.uint8),
+):
+    """One thread per mirror pixel: in doubt where a triangle whose picture is not whole is hit before what was found."""
+    i = first + wp.tid()
+    if int(out_settled[i]) == DOUBT:
+        return
+    found = triangle[i]
+    for k in range(coarse.shape[0]):
+        other = coarse[k]
+        if other != found:
+            corner = scene.triangles[other]
+            hit = intersect_triangle(
+                point[i], direction[i], scene.points[corner[0]], scene.points[corner[1]], scene.points[corner[2]]
+            )
+            if hit.hit == 1 and hit.t > 0.0 and (found < 0 or hit.t < distance[i]):
+                out_settled[i] = wp.uint8(DOUBT)
+                return
+
+
 def settle(
     scene: Scene,
     gbuffer: GBuffer,
@@ -257,6 +286,9 @@ def settle(
     else:
         inputs = [scene.view, scene.neighbours, scene.closed_patches, target.view, *picture, *how, *outputs]
         launch(settle_kernel, pixels.count, inputs, scene.device, settings.threads)
+    if mesh.coarse is not None and len(mesh.coarse):
+        inputs = [scene.view, mesh.coarse, pixels.point, pixels.direction, layer.triangle, layer.distance, settled]
+        launch(coarse_kernel, pixels.count, inputs, scene.device, settings.threads)
     host = settled.numpy()
     if seen is not None:
         triangle = layer.triangle.numpy()

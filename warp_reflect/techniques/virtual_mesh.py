@@ -31,6 +31,11 @@ BUDGET_SHARE = 2.0  # new triangles per triangle of the scene (beside BUDGET_MIN
 BUDGET_MIN = 20000
 RELAX = 2.0  # factor of the tolerance per attempt to meet the budget
 RELAX_STEPS = 24  # 2^23 times the tolerance cuts nothing any more
+MEASURED_LENGTH = 2.0  # of a mirror's radius: the deviation of longer pieces says nothing about that of shorter ones
+# Pieces of a partly hidden triangle that are longer than this share of the mirror end in a straight line where the hidden
+# region's border is curved: what lies between is not drawn. Such triangles are asked for at every pixel (`refine.settle`).
+COARSE_SHARE = 0.25
+COARSE_MAX = 48  # of them at most, the largest first: a test costs 10 ns a pixel, a ray a few hundred
 BOX_MARGIN = wp.constant(8.0)  # pixels around a virtual triangle's straight picture that its bent one may reach
 
 
@@ -45,6 +50,7 @@ class VirtualMesh:
         patches: int32 [triangle_count], the scene patch each belongs to.
         estimated: uint8 [scene triangle_count], pieces along an edge by the estimate that was in force, 1 where whole.
         relaxed: Multiple of the tolerance asked that it was made for, 1 unless the budget was short.
+        coarse: int32 [k], scene triangles whose picture is not whole, see `coarse_triangles`.
     """
 
     points: wp.array
@@ -56,6 +62,7 @@ class VirtualMesh:
     base_count: int
     estimated: np.ndarray
     relaxed: float
+    coarse: wp.array | None = None
 
     @property
     def vertex_count(self) -> int:
@@ -179,19 +186,29 @@ def edge_middles(scene: Scene, ids: np.ndarray) -> np.ndarray:
 
 
 def measured_cuts(
-    scene: Scene, ids: np.ndarray, estimate: np.ndarray, vertices, middles, tolerance_px: float
+    scene: Scene,
+    ids: np.ndarray,
+    estimate: np.ndarray,
+    vertices,
+    middles,
+    tolerance_px: float,
+    unit_per_scene: float,
 ) -> np.ndarray:
     """Pieces per triangle from how far the picture of each edge's middle lies off the straight edge.
 
-    The deviation falls with the square of the pieces. Where a corner or a middle has no picture
-    (behind the mirror's silhouette, which compresses it) the estimate stands up to STRADDLING_MAX.
+    The deviation falls with the square of the pieces, once these are no longer than the mirror; longer ones are asked for
+    by the estimate alone. Where a corner or a middle has no picture (behind the mirror's silhouette, which compresses it)
+    the estimate stands up to STRADDLING_MAX.
 
     Args:
         ids: Scene triangles asked.
         estimate: Their pieces by `needed_cuts`, the upper bound.
         vertices, middles: Solved vertices of the scene, and of `edge_middles`.
         tolerance_px: Deviation allowed. [pixels]
+        unit_per_scene: Of the mirror's unit frame, in which it is about 1 in radius.
     """
+    corner = scene.host_points[scene.host_triangles[ids]].astype(np.float64)
+    longest = np.linalg.norm(corner - corner[:, [1, 2, 0]], axis=2).max(axis=1) * unit_per_scene
     screen = vertices.screen.numpy()[scene.host_triangles[ids]][..., :3].astype(np.float64)
     middle = middles.screen.numpy()[..., :3].reshape(3, len(ids), 3).astype(np.float64).transpose(1, 0, 2)
     seen = (screen[..., 2] > 0.0).all(axis=1) & (middle[..., 2] > 0.0).all(axis=1)
@@ -200,8 +217,36 @@ def measured_cuts(
     length = np.maximum(np.linalg.norm(along, axis=2), 1.0)
     deviation = (np.abs(along[..., 0] * off[..., 1] - along[..., 1] * off[..., 0]) / length).max(axis=1)
     wanted = np.sqrt(np.maximum(deviation / tolerance_px, 1.0))
-    pieces = 2.0 ** np.ceil(np.log2(wanted))
+    pieces = 2.0 ** np.ceil(np.log2(np.maximum(wanted, longest / MEASURED_LENGTH)))
     return np.minimum(np.where(seen, pieces, STRADDLING_MAX), estimate).astype(np.uint8)
+
+
+def coarse_triangles(
+    scene: Scene, part: PartRange, vertices, ids: np.ndarray, middles, cuts: np.ndarray, unit_per_scene: float
+) -> np.ndarray:
+    """Scene triangles that are partly hidden by the mirror and cut into pieces too long for the border of what is hidden.
+
+    Args:
+        vertices, middles: Solved vertices of the scene, and of `edge_middles` of the triangles `ids`.
+        cuts: Pieces along an edge of every scene triangle.
+        unit_per_scene: Of the mirror's unit frame, in which it is about 1 in radius.
+
+    Returns:
+        int32, the largest first.
+    """
+    corner = scene.host_triangles
+    points = scene.host_points[corner].astype(np.float64)
+    longest = np.linalg.norm(points - points[:, [1, 2, 0]], axis=2).max(axis=1) * unit_per_scene / cuts
+    partly = (vertices.status.numpy()[corner] != int(Status.CONVERGED)).any(axis=1)
+    if len(ids):
+        unseen = middles.screen.numpy()[:, 2].reshape(3, len(ids)) <= 0.0
+        partly[ids] |= unseen.any(axis=0)
+    partly[part.first_triangle : part.first_triangle + part.triangle_count] = False
+    seen = scene.seen_in(part)
+    if seen is not None:
+        partly &= seen
+    found = np.flatnonzero(partly & (longest > COARSE_SHARE))
+    return found[np.argsort(-longest[found], kind="stable")][:COARSE_MAX].astype(np.int32)
 
 
 def triangle_cost(cuts: np.ndarray) -> float:
