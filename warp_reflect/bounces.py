@@ -32,10 +32,12 @@ LEAST_WEIGHT = wp.constant(2.0e-3)
 
 def mirror_bodies(scene: Scene, reflectors: Iterable[Reflector]) -> wp.array:
     """`bvh.OwnBody` of every patch of a scene, without triangles where it is no reflector's."""
-    bodies = [bvh.OwnBody() for _ in scene.patch_shapes]
+    # By columns: to make a structure for each of some thousand patches takes as long as a small picture.
+    bodies = np.zeros(len(scene.patch_shapes), bvh.OwnBody.numpy_dtype())
     for reflector in reflectors:
-        for patch in scene.parts[reflector.part].patches:
-            bodies[patch] = bvh.body_of(scene, reflector.part, reflector.convex)
+        body, patches = bvh.body_of(scene, reflector.part, reflector.convex), scene.parts[reflector.part].patches
+        for name in bodies.dtype.names:
+            bodies[name][list(patches)] = getattr(body, name)
     return wp.array(bodies, dtype=bvh.OwnBody, device=scene.device)
 
 
