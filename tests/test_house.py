@@ -22,9 +22,9 @@ FILES = {
 FLOORS = {
     1: "settings launch vector devices optics shapes bodies cubemap quadrics quadric_roots quadric_curve quadric_fit heightfield "
     "grid_rays occupancy voxels "
-    "images metrics timing clipping",
+    "images metrics timing clipping cutouts",
     2: "scene reflectors environment_maps baked_maps segments layers bvh raster raster_vector shade shade_vector surface "
-    "surface_vector pictures textures "
+    "surface_vector pictures textures holes cut_shadows "
     "normal_maps bounces direct shadows transmission waves channels stage stage.* scene_field "
     "baked_environments",
     3: "solve solver solve_device solve_plane solve_convex solve_map solve_general solve_qim solver_gradients mirrors "

@@ -361,14 +361,20 @@ def test_an_index_below_that_of_air_is_clamped_with_a_note(stage):
     assert ["inputs:ior: got 0.5, used as 1" in text for text in texts(data)] == [True]
 
 
-@pytest.mark.parametrize("threshold", [0.0, 0.5])
-def test_opacity_of_a_picture_is_told_once(stage, threshold):
+def test_opacity_of_a_picture_without_a_threshold_is_told_once(stage):
     texture = shader(stage, "p", "UsdUVTexture", file="./map.png")
-    surface(stage, "UsdPreviewSurface", opacity=(texture, "a"), opacityThreshold=threshold)
+    surface(stage, "UsdPreviewSurface", opacity=(texture, "a"), opacityThreshold=0.0)
     data = read_stage(samples.saved(stage))
     assert len(data.instances) == 1 and data.materials[0].opacity == 1.0
     (text,) = texts(data)
-    assert ("cutouts" in text) == (threshold > 0.0)
+    assert "without opacityThreshold" in text and "opacity" not in data.materials[0].textures
+
+
+def test_opacity_of_a_picture_with_a_threshold_is_kept(stage):
+    texture = shader(stage, "p", "UsdUVTexture", file="./map.png")
+    surface(stage, "UsdPreviewSurface", opacity=(texture, "a"), opacityThreshold=0.5)
+    material = read_stage(samples.saved(stage)).materials[0]
+    assert (material.opacity, material.opacity_threshold, material.textures["opacity"].channel) == (1.0, 0.5, "a")
 
 
 def test_transparent_subset_is_cut_out_of_its_mesh(stage):

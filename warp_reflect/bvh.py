@@ -140,6 +140,7 @@ def trace_ray(
     body: OwnBody,
     # Settings:
     retry: int,
+    t_first: float,
 ) -> RayHit:
     """First surface along a ray that starts on a surface or in free space.
 
@@ -153,6 +154,7 @@ def trace_ray(
         facet: Triangle that the ray starts on, never hit; -1 none, and then `body` is empty too.
         body: The mirror around it. A convex one is stepped over, of others what the ray leaves from behind.
         retry: 1: a ray that finds nothing is asked once more, turned by a few ulp.
+        t_first: What is nearer is not met.
 
     Returns:
         The hit; t, u and v are those of `intersect_triangle` from the origin itself, clamped to the triangle.
@@ -166,7 +168,7 @@ def trace_ray(
     if wp.dot(normal, normal) == 0.0:
         offset = float(0.0)
 
-    t0 = float(0.0)
+    t0 = float(t_first)
     asked = int(0)
     step = int(0)
     # A range over the constant would be unrolled, eight traversals long.
@@ -225,7 +227,7 @@ def trace_kernel(
 ):
     """One thread per ray from free space."""
     i = first + wp.tid()
-    hit = trace_ray(mesh_id, scene, origins[i], directions[i], wp.vec3(0.0, 0.0, 0.0), -1, body, 1)
+    hit = trace_ray(mesh_id, scene, origins[i], directions[i], wp.vec3(0.0, 0.0, 0.0), -1, body, 1, 0.0)
     out_triangle[i] = hit.triangle
     out_t[i] = hit.t
     out_u[i] = hit.u
@@ -257,7 +259,7 @@ def trace_pixels_kernel(
     i = first + wp.tid()
     if indexed != 0:
         i = index[i]
-    hit = trace_ray(mesh_id, scene, point[i], direction[i], normal[i], facets[pixel[i]], body, 0)
+    hit = trace_ray(mesh_id, scene, point[i], direction[i], normal[i], facets[pixel[i]], body, 0, 0.0)
     out_triangle[i] = hit.triangle
     out_u[i] = hit.u
     out_v[i] = hit.v
@@ -307,7 +309,7 @@ def retry_pixels_kernel(
                 again = int(1)
     if again == 0 and neighbours > 0:
         return
-    hit = trace_ray(mesh_id, scene, point[i], moved_direction(direction[i]), normal[i], facets[pixel[i]], body, 0)
+    hit = trace_ray(mesh_id, scene, point[i], moved_direction(direction[i]), normal[i], facets[pixel[i]], body, 0, 0.0)
     if hit.status == SKY:
         return
     out_triangle[i] = hit.triangle
@@ -333,7 +335,7 @@ def own_obstacles_kernel(
 ):
     """One thread per mirror pixel."""
     i = first + wp.tid()
-    hit = trace_ray(mesh_id, scene, point[i], direction[i], normal[i], facets[pixel[i]], body, 0)
+    hit = trace_ray(mesh_id, scene, point[i], direction[i], normal[i], facets[pixel[i]], body, 0, 0.0)
     out_blocked[i] = wp.uint8(wp.where(hit.status == SKY, 0, 1))
 
 
@@ -347,6 +349,7 @@ def trace_onward(
     normal: wp.vec3,
     facet: int,
     inside: int,
+    t_first: float,
 ) -> RayHit:
     """First surface along a ray that has gone through a surface; like `trace_ray` otherwise.
 
@@ -359,6 +362,7 @@ def trace_onward(
         facet: Triangle that the ray starts on, never hit.
         inside: 1: the ray is in the body that the facet belongs to. It does not enter that a second time, nor does a ray
             outside leave it a second time close by: a point polished onto an analytic surface is off its facets.
+        t_first: What is nearer is not met.
     """
     result = RayHit()
     result.triangle = -1
@@ -367,7 +371,7 @@ def trace_onward(
     offset = ray_offset(origin)
     start = origin + offset * normal
     part = scene.patches[scene.triangle_patch[facet]].part
-    t0 = float(0.0)
+    t0 = float(t_first)
     asked = int(0)
     step = int(0)
     while step < MAX_STEPS:
@@ -430,7 +434,7 @@ def trace_onward_kernel(
 ):
     """One thread per ray."""
     i = first + wp.tid()
-    hit = trace_onward(mesh_id, scene, point[i], direction[i], normal[i], facet[i], int(inside[i]))
+    hit = trace_onward(mesh_id, scene, point[i], direction[i], normal[i], facet[i], int(inside[i]), 0.0)
     out_triangle[i] = hit.triangle
     out_u[i] = hit.u
     out_v[i] = hit.v
@@ -458,7 +462,7 @@ def trace_bounced_kernel(
     """One thread per ray."""
     i = first + wp.tid()
     body = bodies[scene.triangle_patch[facet[i]]]
-    hit = trace_ray(mesh_id, scene, point[i], direction[i], normal[i], facet[i], body, 1)
+    hit = trace_ray(mesh_id, scene, point[i], direction[i], normal[i], facet[i], body, 1, 0.0)
     out_triangle[i] = hit.triangle
     out_u[i] = hit.u
     out_v[i] = hit.v
@@ -504,7 +508,7 @@ class Tracer:
     def trace(
         self, origins, directions, threads: int = 0, without: OwnBody | None = None
     ) -> tuple[wp.array, wp.array, wp.array, wp.array]:
-        """First hits of rays from free space.
+        """First hits of rays from free space; holes of cut-outs count as there.
 
         Args:
             origins: Scene frame, finite, shape [n, 3] or a vec3 array.
@@ -589,6 +593,10 @@ def trace_pixels(
     # The neighbours' answers are read from a copy, so that the order of threads cannot matter.
     before = wp.clone(layer.status)
     launch.launch(retry_pixels_kernel, count, [*rays, before, *outputs], scene.device, threads)
+    if scene.has_hole is not None:
+        _past_holes(
+            scene, layer, scene.mirror_tracer(part), gbuffer.triangle, pixels.pixel, body=rays[7], threads=threads
+        )
     return count
 
 
@@ -609,6 +617,14 @@ def trace_transmitted(
     inputs = [wp.uint64(scene.tracer.id), scene.view, facet, pixels.point, pixels.normal, pixels.direction, inside]
     outputs = [layer.triangle, layer.u, layer.v, layer.distance, layer.status]
     launch.launch(trace_onward_kernel, pixels.count, inputs + outputs, scene.device, threads, split_min=TRACE_SPLIT_MIN)
+    if scene.has_hole is not None:
+        _past_holes(scene, layer, scene.tracer, facet, inside=inside, threads=threads)
+
+
+def _past_holes(scene: Scene, layer: ReflectionLayer, tracer: Tracer, facet: wp.array, *more, **options) -> None:
+    from warp_reflect import holes  # only scenes with cut-outs need it
+
+    holes.go_past(scene, layer, tracer, facet, *more, **options)
 
 
 def trace_bounced(scene: Scene, layer: ReflectionLayer, facet: wp.array, bodies: wp.array, threads: int = 0) -> None:
@@ -627,6 +643,8 @@ def trace_bounced(scene: Scene, layer: ReflectionLayer, facet: wp.array, bodies:
     launch.launch(
         trace_bounced_kernel, pixels.count, inputs + outputs, scene.device, threads, split_min=TRACE_SPLIT_MIN
     )
+    if scene.has_hole is not None:
+        _past_holes(scene, layer, scene.tracer, facet, bodies=bodies, threads=threads)
 
 
 def own_obstacles(scene: Scene, gbuffer: GBuffer, pixels: MirrorPixels, part: int, threads: int = 0) -> wp.array:

@@ -206,8 +206,8 @@ def with_pictures(data: SceneData) -> SceneData:
     return dataclasses.replace(data, pictures=read_pictures([texture for _, _, texture in used], tell))
 
 
-# Parameters whose pictures are needed: looked up, or decisive for whether a surface is a mirror.
-LOOKED_AT = frozenset((*COLORS, *NUMBERS, *MIRROR_NUMBERS, NORMAL))
+# Parameters whose pictures are needed: looked up, or decisive for whether a surface is a mirror, or is there.
+LOOKED_AT = frozenset((*COLORS, *NUMBERS, *MIRROR_NUMBERS, NORMAL, "opacity"))
 
 
 def note_of(path: str, name: str, text: str) -> Note:

@@ -598,7 +598,12 @@ def draw_scene(
     """
     kept = kept_triangles(scene, without)
     drawn = [(scene.view.triangles[first:end], first) for first, end in kept]
-    return draw_triangles(camera, camera.view(scene), scene.view.points, drawn, threads, kernels)
+    gbuffer = draw_triangles(camera, camera.view(scene), scene.view.points, drawn, threads, kernels)
+    if scene.has_hole is not None:
+        from warp_reflect import holes  # only scenes with cut-outs need it
+
+        holes.look_past(scene, gbuffer, without, threads)
+    return gbuffer
 
 
 def draw_triangles(

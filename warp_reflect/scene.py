@@ -16,6 +16,7 @@ import warp as wp
 
 from warp_reflect.baked_maps import BakedMap
 from warp_reflect.bodies import Body, analyse, weld
+from warp_reflect.cutouts import Cutouts, no_cutouts
 
 wp.set_module_options({"enable_backward": False})
 
@@ -167,6 +168,7 @@ class MaterialData:
     specular_workflow: bool = False
     specular_color: tuple[float, float, float] = (0.0, 0.0, 0.0)
     opacity: float = 1.0  # share of the surface that is there at all; through the rest one looks straight
+    opacity_threshold: float = 0.0  # where the texture of opacity is below it, the surface is not there; 0: no cut-outs
     # Share of the light that enters the surface which goes through instead of being scattered back (glass, water).
     transmission: float = 0.0
     emissive: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -283,6 +285,7 @@ class SceneView:
     triangle_patch: wp.array(dtype=int)
     patches: wp.array(dtype=PatchView)
     materials: wp.array(dtype=MaterialView)
+    cuts: Cutouts
 
 
 @dataclass(frozen=True)
@@ -336,6 +339,11 @@ class Scene:
             self.notes += [note for note in notes if note not in self.notes]
         self.origin = _scene_origin(data)
         self._flatten()
+        self.view.cuts = no_cutouts(self.device)
+        if any(material.opacity_threshold > 0.0 for material in data.materials):
+            from warp_reflect import holes
+
+            self.view.cuts = holes.prepare_cutouts(self, self._pyramids)
 
     @property
     def triangle_count(self) -> int:
@@ -385,6 +393,12 @@ class Scene:
         return self.view is other.view
 
     @cached_property
+    def has_hole(self) -> np.ndarray | None:
+        """Which triangles may have holes by a texture (`cutouts`), bool [triangle_count]; None: no triangle has."""
+        cut = self.view.cuts.of_triangle.numpy()
+        return cut >= 0 if len(cut) else None
+
+    @cached_property
     def _host_neighbours(self) -> np.ndarray:
         # Welded: the seams of gprims and of faceVarying exports must not stop a walk.
         return edge_neighbours(weld(self.host_points, self.host_triangles))
@@ -409,7 +423,8 @@ class Scene:
             area = np.cross(corner[own][:, 1] - corner[own][:, 0], corner[own][:, 2] - corner[own][:, 0])
             # The volume about the part's own middle: about a far origin it would cancel.
             outward = volume[own].sum() - float(area.sum(axis=0) @ middle) > 0.0
-            if part.triangle_count and inside.all() and outward:
+            whole = self.has_hole is None or not self.has_hole[own].any()
+            if part.triangle_count and inside.all() and outward and whole:
                 closed[list(part.patches)] = 1
         return wp.array(closed, dtype=int, device=self.device)
 
@@ -524,7 +539,10 @@ class Scene:
             piece = self.parts[part]
             first = piece.first_vertex
             faces = self.host_triangles[piece.first_triangle : piece.first_triangle + piece.triangle_count]
-            self._bodies[part] = analyse(self.host_points[first : first + piece.vertex_count], faces - first)
+            body = analyse(self.host_points[first : first + piece.vertex_count], faces - first)
+            if self.has_hole is not None and self.has_hole[piece.first_triangle :][: piece.triangle_count].any():
+                body = replace(body, convex=False)  # through its holes it sees its own inside
+            self._bodies[part] = body
         return self._bodies[part]
 
     def _flatten(self) -> None:

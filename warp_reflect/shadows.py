@@ -211,6 +211,40 @@ def polygon_sample(light: AreaView, p: wp.vec3, place: wp.vec2) -> wp.vec4:
     return wp.vec4(d[0], d[1], d[2], distance)
 
 
+@wp.struct
+class AreaRay:
+    """A ray to a sample of a shape."""
+
+    direction: wp.vec3  # unit
+    reach: float  # up to shortly before the shape
+    weight: float  # of what it brings, 0: nothing
+
+
+@wp.func
+def area_ray(light: AreaView, shown: AreaView, p: wp.vec3, n: wp.vec3, place: wp.vec2) -> AreaRay:
+    """The ray from p, of unit normal n, to a shape's sample; `shown` is what `area_shown` says of the shape."""
+    if light.kind == SPHERE:
+        s = sphere_sample(light, p, place)
+    else:
+        s = polygon_sample(shown, p, place)
+    ray = AreaRay()
+    ray.direction = wp.vec3(s[0], s[1], s[2])
+    ray.reach = (1.0 - SHORT_OF_LIGHT) * s[3]
+    ray.weight = wp.max(wp.dot(n, ray.direction), 0.0)
+    if light.kind != SPHERE:
+        ray.weight *= wp.abs(wp.dot(shown.out, ray.direction)) / wp.max(s[3] * s[3], LEAST_SQUARE)
+    return ray
+
+
+@wp.func
+def area_shown(light: AreaView, p: wp.vec3) -> AreaView:
+    """The flat shape that stands for one seen from p, with its normal; a sphere stays what it is."""
+    shown = shown_area(light, p)
+    if light.kind == CYLINDER:
+        shown.out = unit(wp.cross(shown.x, shown.y))
+    return shown
+
+
 @wp.func
 def area_share(mesh_id: wp.uint64, light: AreaView, start: RayStart, shift: wp.vec2, count: int) -> float:
     """Share of a shape's irradiance that arrives by so many samples, 0 to 1; 1 where none has anything to bring."""
@@ -218,26 +252,16 @@ def area_share(mesh_id: wp.uint64, light: AreaView, start: RayStart, shift: wp.v
     n = start.n
     if light.kind == SPHERE and wp.length(light.centre - p) <= light.radius:
         return 1.0
-    shown = shown_area(light, p)
-    if light.kind == CYLINDER:
-        shown.out = unit(wp.cross(shown.x, shown.y))
+    shown = area_shown(light, p)
     brought = float(0.0)
     arrived = float(0.0)
     k = int(0)
     while k < count:
-        place = sample_place(k, shift)
-        if light.kind == SPHERE:
-            s = sphere_sample(light, p, place)
-        else:
-            s = polygon_sample(shown, p, place)
-        d = wp.vec3(s[0], s[1], s[2])
-        weight = wp.max(wp.dot(n, d), 0.0)
-        if light.kind != SPHERE:
-            weight *= wp.abs(wp.dot(shown.out, d)) / wp.max(s[3] * s[3], LEAST_SQUARE)
-        if weight > 0.0:
-            brought += weight
-            if is_free(mesh_id, start, d, (1.0 - SHORT_OF_LIGHT) * s[3]):
-                arrived += weight
+        ray = area_ray(light, shown, p, n, sample_place(k, shift))
+        if ray.weight > 0.0:
+            brought += ray.weight
+            if is_free(mesh_id, start, ray.direction, ray.reach):
+                arrived += ray.weight
         k += 1
     if brought == 0.0:
         return 1.0
@@ -409,6 +433,15 @@ def light_shares_kernel(
         out_share[i * light_count + k] = share
 
 
+@wp.func
+def sky_ray(n: wp.vec3, place: wp.vec2) -> wp.vec3:
+    """A direction of a cosine distribution about a unit normal."""
+    t1, t2 = tangent_basis(n)
+    angle = 2.0 * PI * place[1]
+    radius = wp.sqrt(place[0])
+    return radius * (wp.cos(angle) * t1 + wp.sin(angle) * t2) + wp.sqrt(wp.max(1.0 - place[0], 0.0)) * n
+
+
 @wp.kernel
 def sky_share_kernel(
     first: int,
@@ -429,16 +462,12 @@ def sky_share_kernel(
     if triangle[i] < 0:
         return
     start = ray_start(scene, triangle[i], u[i], v[i], direction[i], normals, i)
-    t1, t2 = tangent_basis(start.n)
     shift = sample_shift(pixel, i, width)
     free = float(0.0)
     asked = float(0.0)
     k = int(0)
     while k < count:
-        place = sample_place(k, shift)
-        angle = 2.0 * PI * place[1]
-        radius = wp.sqrt(place[0])
-        d = radius * (wp.cos(angle) * t1 + wp.sin(angle) * t2) + wp.sqrt(wp.max(1.0 - place[0], 0.0)) * start.n
+        d = sky_ray(start.n, sample_place(k, shift))
         # A normal map, or an interpolated normal, looks below its own facet.
         if wp.dot(d, start.side) > 0.0:
             asked += 1.0
@@ -479,6 +508,12 @@ def shadowed_irradiance(
     areas = _flags(cast.areas, device)
     world = [wp.uint64(scene.tracer.id), scene.view, scene.lights.direct]
     at = [*_arrays(points, normals, device), points.pixel, points.width]
+    if scene.has_hole is not None:
+        from warp_reflect import cut_shadows  # only scenes with cut-outs need it
+
+        inputs = [*world, _flags(cast.distant, device), areas, *at, cast.samples]
+        cut_shadows.cut_irradiance(inputs, result, threads)
+        return result
     found = wp.zeros(count * len(areas) if any(cast.areas) else 0, dtype=wp.uint8, device=device)
     index = wp.zeros(0, dtype=int, device=device)
     if any(cast.areas):
@@ -511,12 +546,17 @@ def sky_share(
     result = wp.zeros(len(points.triangle), dtype=float, device=device)
     inputs = [wp.uint64(scene.tracer.id), scene.view, *_arrays(points, normals, device)]
     inputs += [points.pixel, points.width, samples, result]
+    if scene.has_hole is not None:
+        from warp_reflect import cut_shadows
+
+        cut_shadows.cut_sky_share(inputs[:-1], result, threads)
+        return result
     launch.launch(sky_share_kernel, len(points.triangle), inputs, device, threads, split_min=TRACE_SPLIT_MIN)
     return result
 
 
 def light_shares(scene: Scene, points: Points, samples: int, threads: int = 0) -> tuple[np.ndarray, ...]:
-    """What each light would bring to points, and which share of it arrives; without normal maps.
+    """What each light would bring to points, and which share of it arrives; without normal maps, cut-outs uncut.
 
     Returns:
         (unit normals on the viewer's side float32 [n, 3]; unshadowed irradiance float32 [n, lights, 3], distant lights

@@ -11,6 +11,7 @@ import numpy as np
 import warp as wp
 
 from warp_reflect import launch
+from warp_reflect.cutouts import WRAPS, wrapped_coordinate, wrapped_texel
 from warp_reflect.layers import CameraView, GBuffer, ReflectionLayer, eye_ray_direction, eye_ray_origin
 from warp_reflect.pictures import (
     COLORS,
@@ -36,13 +37,6 @@ from warp_reflect.shapes import clamp_weights, facet_normal, intersect_triangle,
 wp.set_module_options({"enable_backward": False})
 
 TEXELS_MAX = 2**28  # float32 values of all pyramids together (1 GiB); above it all lose their finest level
-
-WRAP_REPEAT = wp.constant(0)
-WRAP_CLAMP = wp.constant(1)
-WRAP_MIRROR = wp.constant(2)
-WRAP_BLACK = wp.constant(3)
-# A wrap mode in the file's metadata is not looked for: repeat is what exporters that write none mean.
-WRAPS = {"useMetadata": 0, "repeat": 0, "clamp": 1, "mirror": 2, "black": 3}
 
 # At a grazing angle the cone's footprint is a line; a box filter that covered its length would blur it across.
 LEAST_COSINE = wp.constant(0.1)
@@ -190,7 +184,7 @@ def prepare_textures(scene: Scene, pyramids: dict[str, Pyramid]) -> TextureSet:
     result = TextureSet()
     device = scene.device
     flat = np.concatenate(texels) if texels else np.zeros(0, np.float32)
-    uvs, uv_index = _coordinates(data) if views else (np.zeros((0, 2), np.float32), np.zeros((0, 3), np.int32))
+    uvs, uv_index = coordinates(data) if views else (np.zeros((0, 2), np.float32), np.zeros((0, 3), np.int32))
     result.bindings = wp.array(bindings if views else [], dtype=BindingView, device=device)
     result.textures = wp.array(views, dtype=TextureView, device=device)
     result.levels = wp.array(levels, dtype=LevelView, device=device)
@@ -249,7 +243,7 @@ def _texture_view(texture: TextureRef, first_level: int, levels: tuple[np.ndarra
     return view
 
 
-def _coordinates(data: SceneData) -> tuple[np.ndarray, np.ndarray]:
+def coordinates(data: SceneData) -> tuple[np.ndarray, np.ndarray]:
     """Texture coordinates float32 [n, 2] and their indices int32 [triangle_count, 3], in the scene's order."""
     uvs, index = [], []
     first: dict[int, int] = {}  # by mesh: its instances share the coordinates
@@ -268,39 +262,6 @@ def _coordinates(data: SceneData) -> tuple[np.ndarray, np.ndarray]:
         flip = np.linalg.det(instance.world_from_object[:3, :3]) < 0.0
         index.append(own[:, [0, 2, 1] if flip else [0, 1, 2]] + np.int32(first[instance.mesh]))
     return np.concatenate(uvs).astype(np.float32), np.concatenate(index).astype(np.int32)
-
-
-@wp.func
-def wrapped_coordinate(x: float, mode: int) -> float:
-    """A picture coordinate brought near [0, 1], so that no integer overflows."""
-    if mode == WRAP_REPEAT:
-        return x - wp.floor(x)
-    if mode == WRAP_MIRROR:
-        return x - 2.0 * wp.floor(0.5 * x)
-    return wp.clamp(x, -1.0, 2.0)
-
-
-@wp.func
-def wrapped_texel(i: int, count: int, mode: int) -> int:
-    """The texel that one of `wrapped_coordinate` stands for; -1: black."""
-    k = i
-    if mode == WRAP_REPEAT:
-        if k < 0:
-            k += count
-        if k >= count:
-            k -= count
-    elif mode == WRAP_MIRROR:
-        # Two periods: a neighbour of the last texel of the second is the first of the next.
-        if k < 0:
-            k = -1 - k
-        if k >= 2 * count:
-            k -= 2 * count
-        if k >= count:
-            k = 2 * count - 1 - k
-    elif mode == WRAP_BLACK:
-        if k < 0 or k >= count:
-            return -1
-    return wp.clamp(k, 0, count - 1)
 
 
 @wp.func

@@ -279,7 +279,7 @@ def _read_surface(shader: UsdShade.Shader, parameters, path: str, intake: Intake
         textures[NORMAL] = normal
     values["specular_workflow"] = value_of(shader, "useSpecularWorkflow", intake) == 1
     _read_opacity(shader, values, textures, primvars, path, intake)
-    unshaded = sorted(set(textures) - {*SHADED_TEXTURES, NORMAL})
+    unshaded = sorted(set(textures) - {*SHADED_TEXTURES, NORMAL, "opacity"})
     if unshaded:
         intake.note(path, f"textures of {', '.join(unshaded)} are read but not shaded; constants are used")
     unused = UNUSED_PREVIEW if parameters is _PREVIEW else UNUSED
@@ -291,17 +291,20 @@ def _read_surface(shader: UsdShade.Shader, parameters, path: str, intake: Intake
 
 
 def _read_opacity(shader, values: dict, textures: dict, primvars: list, path: str, intake: Intake) -> None:
-    """Opacity by the rules of UsdPreviewSurface; of a picture there is none.
+    """Opacity by the rules of UsdPreviewSurface; of a picture there is none but what a threshold cuts out of it.
 
     Without a threshold and in the mode "transparent", the default, what is not opaque lets light through and still mirrors, as
     glass does; otherwise, and in MaterialX, that share of the surface is not there.
     """
     threshold = value_of(shader, "opacityThreshold", intake)
     threshold = float(threshold) if isinstance(threshold, (int, float)) and np.isfinite(threshold) else 0.0
-    if textures.pop("opacity", None) is not None:
-        cut = "cutouts by a texture are not simulated" if threshold > 0.0 else "a texture's opacity is not simulated"
-        intake.note(path, f"inputs:opacity: {cut}; drawn opaque")
+    if "opacity" in textures:
         values["opacity"] = 1.0
+        if threshold > 0.0:
+            values["opacity_threshold"] = threshold
+            return
+        del textures["opacity"]
+        intake.note(path, "inputs:opacity: a texture's opacity without opacityThreshold is not simulated; drawn opaque")
     elif any(each.parameter.field == "opacity" for each in primvars):
         return
     elif threshold > 0.0:

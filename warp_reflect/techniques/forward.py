@@ -277,6 +277,11 @@ def reflect(
                 settings.threads,
             )
         layer.statistics.update(candidate=pixels.count)
+        doubtful = refine.in_doubt_of_holes(scene, layer)
+        if doubtful is not None:
+            bvh.trace_pixels(
+                scene, gbuffer, pixels, layer, reflector.part, reflector.convex, doubtful, settings.threads
+            )
     else:
         with timer("own_body"):
             blocked = wp.zeros(0, dtype=wp.uint8, device=scene.device)

@@ -246,6 +246,19 @@ def coarse_kernel(
                 return
 
 
+def _on_cut(scene: Scene, layer: ReflectionLayer) -> np.ndarray:
+    """At which pixels a layer shows a triangle that may have holes, bool [pixels]; the scene has some."""
+    triangle = layer.triangle.numpy()
+    return (triangle >= 0) & scene.has_hole[np.maximum(triangle, 0)]
+
+
+def in_doubt_of_holes(scene: Scene, layer: ReflectionLayer) -> wp.array | None:
+    """int32 indices of the pixels that show a triangle that may have holes; None: no triangle of the scene has."""
+    if scene.has_hole is None:
+        return None
+    return wp.array(np.flatnonzero(_on_cut(scene, layer)).astype(np.int32), dtype=int, device=scene.device)
+
+
 def settle(
     scene: Scene,
     gbuffer: GBuffer,
@@ -293,6 +306,9 @@ def settle(
     if seen is not None:
         triangle = layer.triangle.numpy()
         host = np.where((triangle >= 0) & ~seen[np.maximum(triangle, 0)], DOUBT, host)
+    if scene.has_hole is not None:
+        # Whether a hole is met there, and what is behind it, is for a ray to say.
+        host = np.where(_on_cut(scene, layer), DOUBT, host)
     doubtful = np.flatnonzero(host == DOUBT).astype(np.int32)
     counts = np.bincount(host, minlength=4)
     layer.statistics.update(
