@@ -13,7 +13,7 @@ from panes import GLASS, HALF, SIZE, WATER, eye_rays, floor_error_px, frame, sta
 from rooms import placed, sphere, square
 
 import warp_reflect as wr
-from warp_reflect.scene import MaterialData, MeshData
+from warp_reflect.scene import LightData, MaterialData, MeshData
 
 
 def refracted(d, n, ior):
@@ -183,6 +183,21 @@ def test_white_furnace_stays_white(material, left, body):
     else:
         # What a body reflects inside is lost: 4 % at normal incidence.
         assert left - 0.15 < rgb[inner].mean() <= left + 1e-3
+
+
+@pytest.mark.parametrize(("transmission", "shadowed"), [(1.0, False), (0.9, False), (0.2, True)])
+def test_clear_glass_casts_no_shadow(transmission, shadowed):
+    sun = LightData("/sun", "distant", (1.0,) * 3, np.eye(4))
+    sun.world_from_light[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]  # shines down
+    pane = square(1, 1.0), placed(0, 3.0, -1.0), dataclasses.replace(GLASS, transmission=transmission)
+    scenes = [stage(*things, sky=0.2) for things in ((), (pane,))]
+    lit = [type(each)(dataclasses.replace(each._source, lights=[*each._source.lights, sun])) for each in scenes]
+    bare, covered = (frame(each, shadows="on")["RGBA"][..., 0] for each in lit)
+    below = np.zeros(SIZE[::-1], bool)
+    floor = frame(lit[1])["primId"] == 1
+    below[floor] = (bare - covered)[floor] > 0.1
+    assert (below.sum() > 200) == shadowed
+    assert (frame(scenes[0])["RGBA"][..., 0] < bare).mean() > 0.2  # the sun shines
 
 
 def test_the_plan_says_why():

@@ -126,6 +126,10 @@ class MirrorData:
     reflects: tuple[str, ...] | None = None  # prims that are seen in it, with all below; None: everything
 
 
+# Share of the light on a surface that neither goes through nor past it, below which the surface casts no shadow.
+CASTING_SHARE = 0.5
+
+
 @dataclass(frozen=True)
 class FinishData:
     """What the user asks of a surface for what is seen in it and through it (`WarpReflectFinishAPI`)."""
@@ -497,21 +501,41 @@ class Scene:
     @cached_property
     def still_tracer(self):
         """The owner of the structure (`bvh.Tracer`) over all but the moving parts, built at first use."""
-        from warp_reflect import bvh
+        return self._masked_tracer(self._stands_still()) if self.moving_parts else self.tracer
 
-        if not self.moving_parts:
-            return self.tracer
+    def _stands_still(self) -> np.ndarray:
         still = np.ones(self.triangle_count, bool)
         for part in (self.parts[k] for k in self.moving_parts):
             still[part.first_triangle : part.first_triangle + part.triangle_count] = False
-        return bvh.Tracer(self, seen=still)
+        return still
+
+    @cached_property
+    def shadow_tracer(self):
+        """The owner of the structure (`bvh.Tracer`) over what casts shadows: what lets most of the light through does not."""
+        casts = self._casts_shadows()
+        return self.tracer if casts.all() else self._masked_tracer(casts)
+
+    def _casts_shadows(self) -> np.ndarray:
+        casts = np.ones(self.triangle_count, bool)
+        for part in self.parts:
+            material = self.data.materials[part.material]
+            if material.opacity * (1.0 - material.transmission) < CASTING_SHARE:
+                casts[part.first_triangle : part.first_triangle + part.triangle_count] = False
+        return casts
+
+    def _masked_tracer(self, seen: np.ndarray):
+        from warp_reflect import bvh
+
+        return bvh.Tracer(self, seen=seen)
 
     def with_still_rays(self) -> Scene:
         """The same scene whose rays, those of shadows too, meet nothing that moves."""
         if not self.moving_parts:
             return self
         other = copy.copy(self)
-        other.tracer = self.still_tracer
+        other.tracer = other.shadow_tracer = self.still_tracer
+        if not (casts := self._casts_shadows()).all():
+            other.shadow_tracer = self._masked_tracer(casts & self._stands_still())
         return other
 
     def keep_still_tracer(self, earlier: Scene) -> None:

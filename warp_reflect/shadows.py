@@ -506,7 +506,7 @@ def shadowed_irradiance(
     count = len(points.triangle)
     result = wp.zeros(count, dtype=wp.vec3, device=device)
     areas = _flags(cast.areas, device)
-    world = [wp.uint64(scene.tracer.id), scene.view, scene.lights.direct]
+    world = [wp.uint64(scene.shadow_tracer.id), scene.view, scene.lights.direct]
     at = [*_arrays(points, normals, device), points.pixel, points.width]
     if scene.has_hole is not None:
         from warp_reflect import cut_shadows  # only scenes with cut-outs need it
@@ -544,7 +544,7 @@ def sky_share(
     """
     device = scene.device
     result = wp.zeros(len(points.triangle), dtype=float, device=device)
-    inputs = [wp.uint64(scene.tracer.id), scene.view, *_arrays(points, normals, device)]
+    inputs = [wp.uint64(scene.shadow_tracer.id), scene.view, *_arrays(points, normals, device)]
     inputs += [points.pixel, points.width, samples, result]
     if scene.has_hole is not None:
         from warp_reflect import cut_shadows
@@ -568,7 +568,13 @@ def light_shares(scene: Scene, points: Points, samples: int, threads: int = 0) -
     normal = wp.zeros(count, dtype=wp.vec3, device=device)
     unshadowed = wp.zeros(count * lights, dtype=wp.vec3, device=device)
     share = wp.zeros(count * lights, dtype=float, device=device)
-    inputs = [wp.uint64(scene.tracer.id), scene.view, scene.lights.direct, *_arrays(points, None, device), samples]
+    inputs = [
+        wp.uint64(scene.shadow_tracer.id),
+        scene.view,
+        scene.lights.direct,
+        *_arrays(points, None, device),
+        samples,
+    ]
     launch.launch(
         light_shares_kernel, count, [*inputs, normal, unshadowed, share], device, threads, split_min=TRACE_SPLIT_MIN
     )
