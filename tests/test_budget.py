@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -185,6 +186,39 @@ def test_larger_budget_is_never_less_accurate(ball_room):
         losses.append(loss(plan.rows[0].predicted))
         assert plan.predicted["ms"] <= budget or any("cannot be met" in note.text for note in plan.notes)
     assert losses == sorted(losses, reverse=True) and losses[-1] == 0.0
+
+
+@pytest.fixture(scope="module")
+def checker(device):
+    return wr.load_stage(Path(__file__).parent.parent / "usd_scenes" / "sphere_on_checker.usda", device=str(device))
+
+
+@pytest.mark.parametrize(
+    "method, settings",
+    [
+        ("quadric", {}),
+        ("quadric", {"refine": "off"}),
+        ("quadric", {"refine": "off", "edge_px": 1.0}),
+        ("quadric", {"refine": "off", "edge_px": 0.0}),
+        ("reflector_map", {"refine": "off", "map_resolution": 64}),
+        ("reflector_map", {"refine": "off", "grid_error_px": 0.5}),
+        ("reflector_map", {"refine": "off", "search": "midpoint", "iterations": 5}),
+        ("environment", {}),
+    ],
+)
+def test_errors_come_out_within_the_bounds_of_what_is_predicted(method, settings, checker):
+    """At most 1.3 times the predicted error, at most 1.5 times the predicted share of wrong pixels and 0.5 %."""
+    plan = wr.make_plan(checker, size=(240, 135), settings=Settings(shadows="off", **settings), method=method)
+    predicted = plan.rows[0].predicted
+    got = realised_error(wr.render_frame(checker, plan), pixels=20000)
+    assert plan.rows[0].technique == method and got.pixels > 4000
+    shown = got.wrong_share < 0.05  # else the 95th percentile is no number
+    if method != "environment":
+        assert got.wrong_share <= 1.5 * predicted["wrong_share"] + 0.005
+    else:
+        # What lies nearer than the map thinks is shifted by more pixels than a tile holds.
+        assert predicted["error_px"] > 4.0
+    assert not shown or got.error_p95_px <= 1.3 * predicted["error_px"] + 0.01
 
 
 # From frame to frame.

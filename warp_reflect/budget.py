@@ -90,14 +90,16 @@ TEXEL_BYTES = {"reflector_map": 32, "environment": 24, "layered_environment": 24
 LOCAL_RAYS = 0.15  # share of a local map's texels that have a ray of their own
 
 # Errors, at the 95th percentile of the mirror pixels. Measured on this package's scenes where no other source is given.
-EDGE_ERROR = 0.4  # of the bend that `edge_px` allows: few edges use it up
-EDGE_FLOOR = 0.05  # pixels; corners of virtual triangles are right, what lies between is interpolated
-UNCUT_ERROR = 1.2  # pixels: the papers' picture, straight edges between exact vertices
+EDGE_ERROR = 0.5  # of the bend that `edge_px` allows: few edges use it up
+EDGE_FLOOR = 0.1  # pixels; corners of virtual triangles are right, what lies between is interpolated
+UNCUT_ERROR = 2.8  # pixels: the papers' picture, straight edges between exact vertices
 # Shares of the mirror pixels that show another thing: silhouettes that lie elsewhere, holes beside triangles cut
 # differently; by `refine`. Those of an uncut mesh are so many that the percentile is no measure of it any more.
-WRONG_SHARE = {"exact": 2.0e-4, "strict": 7.0e-5, "off": 2.0e-2}
+WRONG_SHARE = {"exact": 2.0e-4, "strict": 7.0e-5, "off": 0.0}
 WRONG_UNCUT = {"exact": 3.0e-3, "strict": 1.0e-3, "off": 0.15}
-WRONG_COARSE = 0.02  # added per pixel of `edge_px`, unrefined
+# Unrefined, added: so many pixels to the half extent of a mirror, and more for every pixel of `edge_px`. Silhouettes grow with
+# the extent, the picture with its square. The kitchen's; of the scenes measured none has more.
+WRONG_BORDER, WRONG_COARSE = 3.6, 2.0
 # A wrong pixel counts as so many pixels of error where plans are compared.
 WRONG_PX = 30.0
 # Error of a reflection point over the mirror's half extent, 95 %: bilinear maps err by 0.2 h^2, h the texel.
@@ -274,7 +276,8 @@ def _error(work: Work, technique: str, settings: Settings) -> tuple[float, float
     if settings.refine != "off":
         return 0.0, wrong
     error = UNCUT_ERROR if uncut else EDGE_FLOOR + (EDGE_ERROR * settings.edge_px if curved else 0.0)
-    wrong += 0.0 if uncut or not curved else WRONG_COARSE * settings.edge_px
+    wrong += (WRONG_BORDER + (WRONG_COARSE * settings.edge_px if curved else 0.0)) / max(work.size_px, WRONG_BORDER)
+    wrong = min(wrong, 1.0)
     if technique in ("reflector_map", "explosion_map"):
         texel = 2.0 / (settings.map_resolution - 1)
         error += work.size_px * MAP_ERROR * texel * texel
