@@ -20,53 +20,53 @@ class Costs:
     `calibration.measure` finds them for another machine. Ratios between them decide, and those vary less.
     """
 
-    trace: float = 0.45
+    trace: float = 0.5
     """A reflected ray through a BVH of `TRACE_BASE` triangles; grows with their logarithm."""
-    mirrored: float = 0.02
+    mirrored: float = 0.12
     """A vertex mirrored in a plane."""
-    quadric_cold: float = 0.5
+    quadric_cold: float = 0.45
     """A vertex solved on a quadric, from nothing, boxes and the rest of a search's step included."""
-    quadric_warm: float = 0.16
+    quadric_warm: float = 0.33
     """The same from the last frame's answer."""
     map_cold: float = 0.55
     """A vertex solved in a map, from nothing."""
-    map_warm: float = 0.16
+    map_warm: float = 0.47
     """The same from the last frame's answer."""
-    branches: float = 20.0
+    branches: float = 8.0
     """A vertex whose every reflection point on a concave side is searched."""
-    bent: float = 0.6
+    bent: float = 0.05
     """A vertex whose edges are looked at, whether they bend, on a frame that cuts anew."""
-    cut: float = 1.0
+    cut: float = 1.5
     """A virtual vertex added where they do."""
-    draw: float = 0.35
+    draw: float = 0.15
     """A virtual triangle, the clipping at the hidden boundary included."""
-    interpolated: float = 0.05
+    interpolated: float = 0.55
     """A vertex interpolated from a grid."""
-    candidate: float = 0.08
+    candidate: float = 0.1
     """A mirror pixel that shows its candidate, unrefined."""
-    refined: float = 0.18
+    refined: float = 0.09
     """A mirror pixel whose candidate is tested."""
-    own_body: float = 0.25
+    own_body: float = 0.4
     """A pixel of a mirror that may see itself."""
-    looked_up: float = 0.12
+    looked_up: float = 0.08
     """A mirror pixel that is looked up in a map of its environment: one bilinear look-up in a cube."""
-    map_texel: float = 0.4
+    map_texel: float = 0.12
     """A texel of an environment map that is drawn: its ray, its shading."""
-    map_triangle: float = 0.1
+    map_triangle: float = 0.09
     """A triangle of the scene, for every face of such a map."""
     blended: float = 0.13
     """A texel of a local map and one of its reference maps: the depth test, the look-up."""
-    followed: float = 0.3
+    followed: float = 0.7
     """A mirror pixel that is followed to what a local map holds, and looked up there."""
-    eye_triangle: float = 0.12
+    eye_triangle: float = 0.06
     """A triangle in the eye's own view."""
-    eye_pixel: float = 0.03
+    eye_pixel: float = 0.06
     """A pixel of the picture: drawn, its mirror found, shaded."""
-    mirror_pixel: float = 0.15
+    mirror_pixel: float = 0.2
     """A mirror pixel: its point and normal, and the shading of what it shows."""
-    shadow: float = 1.0
+    shadow: float = 0.8
     """A ray towards a light, that only asks whether anything is in the way, the rest of shadowing included."""
-    layer: float = 300.0
+    layer: float = 400.0
     """A reflector: what does not depend on counts."""
     sharing: float = 0.85
     """Of a further thread, how much it adds to the first."""

@@ -46,6 +46,7 @@ STEP = 0.004  # by which the eye moves between two frames, of its distance to th
 SEED = 7
 CHROME = MaterialData(base_color=(0.9, 0.9, 0.9), metallic=1.0, roughness=0.0)
 GRID_PX = 0.5
+LOCAL_SIDE = 64  # texels along an edge of a local map
 UNBENT_PX = 1.0e4  # edges are looked at, none is cut
 BENT_PX = 0.03  # as many vertices are added as there were
 
@@ -105,6 +106,9 @@ def _measure(device: str, repeats: int, told: Callable[[str], None]) -> Costs:
     faces = 6 * ball.triangle_count
     found["map_triangle"] = max(drawn[0].us("prepare") - texels[0] * found["map_texel"], 0.0) / faces
     found["looked_up"] = max(drawn[1].us("reflect") - found["layer"], 0.1 * drawn[1].us("reflect")) / drawn[1].pixels
+    local = _timed(ball, "layered_environment", repeats, environment_resolution=LOCAL_SIDE)
+    # What its maps were blended from is kept with the scene, and that step's built-in cost stands.
+    found["followed"] = max(local.us("reflect") - found["layer"], 0.1 * local.us("reflect")) / local.pixels
     told("the eye's view")
     small, large = (_timed(ball, "none", repeats, size=size) for size in ((240, 135), (960, 540)))
     found["eye_pixel"] = (large.view_us - small.view_us) / (large.picture - small.picture)
