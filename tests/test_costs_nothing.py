@@ -21,6 +21,7 @@ SUN = LightData(
     "/sun", "distant", (1.0, 1.0, 1.0), np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 )
 WAVY = FinishData("/mirror", wave_slope=0.05)
+MATT = MaterialData()
 PACKAGE = "warp_reflect."
 
 
@@ -39,6 +40,7 @@ class Case:
     settings: dict = field(default_factory=dict)
     of: str = "ball"
     mirror: MaterialData = CHROME
+    others: MaterialData = MATT
     lights: tuple = ()
     moves: bool = False
     owns: tuple[str, ...] = ()
@@ -85,10 +87,16 @@ CASES = {
         twin={"settings": {}},
     ),
     "reuse": Case("quadric", {"reuse_px": 0.5}, moves=True, owns=("techniques.reuse",), twin={"settings": {}}),
+    "second_bounce": Case(settings={"bounces": 2}, others=CHROME, owns=("bounces",), twin={"others": MATT}),
     "roughness": Case(
         mirror=dataclasses.replace(CHROME, roughness=0.2),
         owns=("finishes.glossy", "finishes.layer_map"),
         twin={"mirror": CHROME},
+    ),
+    "clearcoat": Case(
+        mirror=dataclasses.replace(CHROME, roughness=0.2, clearcoat=1.0, clearcoat_roughness=0.02),
+        owns=("finishes.coat",),
+        twin={"mirror": dataclasses.replace(CHROME, roughness=0.2)},
     ),
     "fade": Case(settings={"fade_distance": 2.0}, owns=("finishes.fade",), twin={"settings": {}}),
     "waves": Case(
@@ -101,7 +109,7 @@ CASES = {
         holds=lambda f: f.plan.shadows is not None,
     ),
     "transparency": Case(
-        mirror=MaterialData(opacity=0.5), owns=("transmission",), twin={"mirror": MaterialData()}, holds=seen_through
+        mirror=MaterialData(opacity=0.5), owns=("transmission",), twin={"mirror": MATT}, holds=seen_through
     ),
     "frost": Case(
         mirror=MaterialData(transmission=1.0, roughness=0.5),
@@ -109,13 +117,14 @@ CASES = {
         twin={"mirror": MaterialData(transmission=1.0, roughness=0.0)},
     ),
 }
+TEXTURED = {"normal_map"}  # its case takes a picture: test_bumps.py
 # Effects that launch no kernel of their own: they choose an argument of those that run anyway, or the frame they begin at.
-ARGUMENTS = {"collection", "warm_start", "second_bounce", "refraction", "frost_fade"}
+ARGUMENTS = {"collection", "warm_start", "refraction", "frost_fade"}
 
 
 def scene_of(case, device):
     made = room(sphere(), placed(0, 0, 0)) if case.of == "ball" else plane_room()
-    data = dataclasses.replace(made.data, materials=[case.mirror, made.data.materials[1]], lights=list(case.lights))
+    data = dataclasses.replace(made.data, materials=[case.mirror, case.others], lights=list(case.lights))
     return Scene(data, device)
 
 
@@ -150,7 +159,7 @@ def test_every_technique_and_effect_has_its_case(device):
     plans = [drawn(CASES[effect], device)[0].plan for effect in ("shadows", "transparency")]
     (row,), (light,), (pane,) = plans[0].rows, plans[0].lights, plans[1].panes
     named = {*TECHNIQUES, *effects.FINISHES, *effects.PANE_FINISHES, *row.effects, *light.effects, *pane.effects}
-    assert named <= CASES.keys() | ARGUMENTS, named - CASES.keys() - ARGUMENTS
+    assert named <= CASES.keys() | ARGUMENTS | TEXTURED, named - CASES.keys()
 
 
 def test_collection_that_is_not_there_builds_no_structure_of_its_own(device):
@@ -195,7 +204,7 @@ def test_nothing_of_any_effect_is_compiled_or_imported_for_a_picture_without_it(
 
 def test_stage_without_mirrors_does_what_one_told_to_skip_them_does(device):
     """Not more work by a single launch, in planning and drawing: the time follows."""
-    plain = scene_of(Case(mirror=MaterialData()), device)
+    plain = scene_of(Case(mirror=MATT), device)
     mirror = scene_of(Case(), device)
 
     def launches(scene, method):
