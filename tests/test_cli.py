@@ -528,3 +528,20 @@ def test_read_only_cache_lends_its_kernels(cached_module, monkeypatch):
     copy = Path(wp.config.kernel_cache_dir)
     assert copy != cached_module.parent
     assert [path.name for path in copy.iterdir()] == [cached_module.name]
+
+
+def test_warmup_readies_what_the_plan_needs_and_nothing_else(stage, capsys):
+    assert cli.main(["warmup", str(stage), "--res", "64x36"]) == 0
+    first = capsys.readouterr().out.splitlines()
+    assert "warp_reflect.raster" in first and first[-1].startswith(f"{len(first) - 1} modules ready in ")
+    assert not any("environment" in name or "heightfield" in name for name in first)
+    assert cli.main(["warmup", str(stage), "--res", "64x36"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1].endswith(" ready in 0.0 s")
+
+
+def test_warmup_knows_every_kernel_module():
+    from warp_reflect.warmup import kernel_modules
+
+    names = set(kernel_modules())
+    assert {"warp_reflect.raster", "warp_reflect.techniques.refine_vector", "warp_reflect.finishes.glossy"} <= names
+    assert not names & {"warp_reflect.cli", "warp_reflect.settings", "warp_reflect.planner"}

@@ -31,7 +31,7 @@ FLOORS = {
     "refraction solve_refraction solver_arrays reflector_maps techniques techniques.* finishes finishes.*",
     4: "planner effects lighting probe budget choice applicable calibration calibrate realised bake frame motion virtual_objects "
     "seen sweep sweep_report",
-    5: "cli viewer viewer.* pipeline process progress cluster farm",
+    5: "cli warmup viewer viewer.* pipeline process progress cluster farm",
 }
 # Where an imported library may appear, inside functions or out.
 HOMES = {

@@ -1,4 +1,4 @@
-"""The `warp-reflect` command: `plan`, `render`, `bake`, `process`, `view`, `sweep`, `calibrate`, `compare`.
+"""The `warp-reflect` command: `plan`, `render`, `bake`, `process`, `view`, `sweep`, `calibrate`, `warmup`, `compare`.
 
 Results go to standard output, notes and errors to standard error. Exit 0: done; 1: a job failed part way;
 2: cannot be done, with one line that says why; 130, 143: stopped by SIGINT, SIGTERM.
@@ -538,6 +538,41 @@ def calibrate(*, device: str = "cpu", repeats: int = 3, debug: Annotated[bool, P
     file = calibration.store(costs, device)
     print(calibration.table(costs))
     print(f"{file}: kept for {calibration.described(device)}")
+    return DONE
+
+
+@app.command
+def warmup(
+    stage: str | None = None, /, *, opened: StageOptions | None = None, planned: PlanOptions | None = None
+) -> int:
+    """Compile kernels now, so that the first picture needs not wait for them; Warp keeps them from then on.
+
+    Args:
+        stage: A USD file: what its frames need, as planned. Without one: everything, which takes minutes.
+        opened: How the stage is opened.
+        planned: What is simulated, and how.
+    """
+    from warp_reflect import warmup as warm
+
+    opened, planned = opened or StageOptions(), planned or PlanOptions()
+    settings = _settings(planned)
+    _check_method(planned.method)
+    _check_size_options(planned)
+    device = _open_device(opened.device)
+    with reporting(None) as report:
+        if stage is None:
+            report.busy("compiling")
+            names, seconds = warm.warm_all(device, settings.threads)
+        else:
+            _, _, planned, notes = _as_the_stage_asks(stage, [], None, opened, planned)
+            report.busy("reading " + stage)
+            scene = _load(stage, opened, planned, settings, device, None)
+            report.busy("compiling")
+            made = _make_plan(scene, planned, settings)
+            names, seconds = warm.warm_plan(scene, made)
+            report.notes([*notes, *scene.notes, *made.notes])
+    print("\n".join(names))
+    print(f"{len(names)} modules ready in {seconds:.1f} s")
     return DONE
 
 

@@ -1,0 +1,69 @@
+"""Compile kernels before they are needed: those that a stage's frames launch, or all there are."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+from collections.abc import Iterator
+from pathlib import Path
+from time import perf_counter
+
+import warp as wp
+
+from warp_reflect import launch, vector
+from warp_reflect.frame import render_frame
+from warp_reflect.planner import Plan
+from warp_reflect.scene import Scene
+
+PACKAGE = Path(__file__).parent
+
+
+def warm_plan(scene: Scene, plan: Plan) -> tuple[list[str], float]:
+    """Make a first frame, one that follows it, and all their channels.
+
+    Returns:
+        (names of the kernel modules that they launch, seconds of loading and compiling).
+    """
+    before = launch.loading_ms()
+    with launch.recorded() as launches:
+        frame = None
+        for _ in range(2):
+            frame = render_frame(scene, plan, previous=frame)
+            for channel in frame.keys():
+                frame.device_array(channel)
+    names = sorted({name.rpartition(".")[0] for name, _ in launches})
+    return names, (launch.loading_ms() - before) / 1000.0
+
+
+def warm_all(device: wp.DeviceLike, threads: int = 0) -> tuple[list[str], float]:
+    """Compile every kernel module of the package, several at a time.
+
+    Args:
+        device: Where they are to run.
+        threads: Modules compiled at a time; 0: one per core.
+
+    Returns:
+        (names of the modules, seconds).
+    """
+    start = perf_counter()
+    device = wp.get_device(device)
+    names = [name for name in kernel_modules() if not name.endswith("_vector") or _runs_vectors(device)]
+    modules = []
+    for name in names:
+        importlib.import_module(name)
+        modules.append(wp.get_module(name))
+    block = launch.CPU_BLOCK_DIM if device.is_cpu else None
+    wp.force_load(device, modules, block, launch.thread_count("cpu", threads))
+    return names, perf_counter() - start
+
+
+def kernel_modules() -> Iterator[str]:
+    """Names of the package's modules that define kernels, without importing them."""
+    for path in sorted(PACKAGE.rglob("*.py")):
+        functions = (node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.FunctionDef))
+        if any(ast.unparse(mark).startswith("wp.kernel") for each in functions for mark in each.decorator_list):
+            yield ".".join((PACKAGE.name, *path.relative_to(PACKAGE).with_suffix("").parts))
+
+
+def _runs_vectors(device: wp.Device) -> bool:
+    return device.is_cpu and not vector.missing()
