@@ -557,9 +557,8 @@ def seen_radiance(
 
         areas = summed_late(scene, shadows)
         direct, sky = arriving(scene, gbuffer, layer, normals, threads, shadows, len(areas) > 0)
-        inputs = [scene.view, scene.triangle_records, scene.lights, areas, looks, normals, direct, sky]
-        inputs += [SHARP_ROUGHNESS, ROUGH_ROUGHNESS, pixels.direction, layer.triangle, layer.u, layer.v, radiance]
-        vector.launch_blocks(shade_vector.seen_blocks_kernel, pixels.count, inputs, scene.device, threads)
+        light = [scene.lights, areas, looks, normals, direct, sky, SHARP_ROUGHNESS, ROUGH_ROUGHNESS]
+        shade_vector.shade_rays(scene, gbuffer, layer, light, radiance, threads)
         return radiance
     direct, sky = arriving(scene, gbuffer, layer, normals, threads, shadows)
     inputs = [scene.view, scene.lights, looks, normals, direct, sky, pixels.direction, layer.triangle, layer.u, layer.v]
@@ -622,18 +621,17 @@ def shade(
     lights, looks, normals = scene.lights, shown.looks, shown.normals
     picture = wp.empty(count, dtype=wp.vec4, device=device)
     mirror = wp.empty(count, dtype=wp.vec3, device=device)
-    seen = [gbuffer.triangle, gbuffer.reflector_id, picture, mirror]
     if vector.chosen(kernels, device):
         from warp_reflect import shade_vector  # which shades with this module's structures
 
         areas = summed_late(scene, shadows)
         direct, sky = arriving(scene, gbuffer, None, normals, threads, shadows, len(areas) > 0)
-        inputs = [scene.view, scene.triangle_records, gbuffer.view, lights, areas, looks, normals, direct, sky]
-        inputs += [SHARP_ROUGHNESS, ROUGH_ROUGHNESS, *seen]
-        vector.launch_blocks(shade_vector.shade_blocks_kernel, count, inputs, device, threads)
+        light = [lights, areas, looks, normals, direct, sky, SHARP_ROUGHNESS, ROUGH_ROUGHNESS]
+        shade_vector.shade_eye(scene, gbuffer, light, picture, mirror, threads)
     else:
         direct, sky = arriving(scene, gbuffer, None, normals, threads, shadows)
-        inputs = [scene.view, gbuffer.view, lights, looks, normals, direct, sky, *seen]
+        inputs = [scene.view, gbuffer.view, lights, looks, normals, direct, sky, gbuffer.triangle]
+        inputs += [gbuffer.reflector_id, picture, mirror]
         launch.launch(shade_kernel, count, inputs, device, threads)
     for layer in layers.values():
         radiance = shown.seen(layer)

@@ -11,15 +11,19 @@ import warp as wp
 
 from warp_reflect import vector
 from warp_reflect.direct import AreaView
-from warp_reflect.layers import CameraView
-from warp_reflect.scene import SceneView
+from warp_reflect.layers import CameraView, GBuffer, ReflectionLayer
+from warp_reflect.scene import Scene, SceneView
 from warp_reflect.shade import LightView
 from warp_reflect.textures import Look
 
 wp.set_module_options({"enable_backward": False})
 
-# Expects `triangle`, `scene`, `records`, `lights`, `areas`, `looks`, `normals`, `direct`, `sky`, `block`.
-_SHADING = r"""
+
+@wp.func_native(
+    vector.snippet(
+        r"""
+// A loop over lanes that is kept one: unrolled, the reads of some thirty fields of 16 lanes would take seconds to compile.
+#define SLOWLY _Pragma("clang loop unroll(disable)")
     const float pi = 3.14159265358979f;
     const int count = triangle.shape[0];
     const int begin = block * BLOCK;
@@ -91,26 +95,21 @@ _SHADING = r"""
     struct Lit { V base, mirror; };
     // What lanes `seen` of points `own` on triangles `tri` give back along unit rays: base radiance and weight of the mirror
     // term, whose direction is left in `onward`. `weights` gives u and v, and is asked only where they matter.
-    auto lit = [&](I seen, I own, I tri, V ray, I reflector, auto weights, V& onward) -> Lit {
+    auto lit = [&](I seen, I own, I tri, V ray, I reflector, const auto& weights, V& onward) -> Lit {
         V p0, p1, p2;
         corners(records.data, tri, p0, p1, p2);
         const I patch = igather(scene.triangle_patch.data, tri);
-        // One patch for all lanes, or for each its own.
+        // One patch for all lanes, or for each its own: then their fields are turned into rows of a table first.
         const bool alone = !bits(patch != patch[0]);
         const auto* patches = scene.patches.data;
-        auto of_patch = [&](auto read) -> F {
-            if (alone) return F(read(patches[patch[0]]));
-            F v;
-            EACH_LANE v[l] = read(patches[patch[l]]);
-            return v;
-        };
-        I shape, material;
-        if (alone) {
-            shape = I(patches[patch[0]].shape);
-            material = I(patches[patch[0]].material);
-        } else {
-            EACH_LANE { shape[l] = patches[patch[l]].shape; material[l] = patches[patch[l]].material; }
+        int patch_of[LANES], shapes[LANES], material_of[LANES];
+        istore(patch_of, patch);
+        SLOWLY for (int l = 0; l < LANES; ++l) {
+            const auto& each = patches[patch_of[l]];
+            shapes[l] = each.shape;
+            material_of[l] = each.material;
         }
+        const I shape = iload(shapes);
         const int* normal_index = (const int*)scene.normal_index.data;
         const I first_normal = igather(normal_index, 3 * tri);
         const I smooth = first_normal >= 0;
@@ -133,16 +132,23 @@ _SHADING = r"""
         }
         const V p = add(add(times(w, p0), times(u, p1)), times(v, p2));
         if (bits(seen & quadric)) {
+            float rows[14 * LANES];
+            const int unlike = alone ? 1 : LANES;
+            SLOWLY for (int l = 0; l < unlike; ++l) {
+                const auto& each = patches[patch_of[l]];
+                for (int k = 0; k < 12; ++k) rows[k * LANES + l] = each.unit_from_scene.data[k / 4][k % 4];
+                rows[12 * LANES + l] = each.quadric[0];
+                rows[13 * LANES + l] = each.quadric[1];
+            }
+            if (alone) SLOWLY for (int k = 0; k < 14; ++k) store(rows + k * LANES, F(rows[k * LANES]));
             V row[3];
             F shift[3];
             _Pragma("clang loop unroll(full)") for (int k = 0; k < 3; ++k) {
-                row[k] = V{of_patch([k](const auto& a) { return a.unit_from_scene.data[k][0]; }),
-                    of_patch([k](const auto& a) { return a.unit_from_scene.data[k][1]; }),
-                    of_patch([k](const auto& a) { return a.unit_from_scene.data[k][2]; })};
-                shift[k] = of_patch([k](const auto& a) { return a.unit_from_scene.data[k][3]; });
+                const float* from = rows + 4 * k * LANES;
+                row[k] = V{load(from), load(from + LANES), load(from + 2 * LANES)};
+                shift[k] = load(from + 3 * LANES);
             }
-            const F a = of_patch([](const auto& q) { return q.quadric[0]; });
-            const F b = of_patch([](const auto& q) { return q.quadric[1]; });
+            const F a = load(rows + 12 * LANES), b = load(rows + 13 * LANES);
             const F x = dot(row[0], p) + shift[0], y = dot(row[1], p) + shift[1];
             const F z = a * (dot(row[2], p) + shift[2]) + 0.5f * b;
             n = vpick(quadric, unit(add(add(times(x, row[0]), times(y, row[1])), times(z, row[2]))), n);
@@ -157,40 +163,48 @@ _SHADING = r"""
         const F cosine = __builtin_elementwise_abs(along);
 
         // textures.plain_look, or what was looked up before.
-        V base_color, f0, f90, emissive;
-        F roughness, clearcoat, clearcoat_roughness, clearcoat_f0, opacity, through;
-        auto look_of = [&](auto element) {
-            auto vector_of = [&](auto read) -> V {
-                return V{element([&](const auto& a) { return read(a)[0]; }), element([&](const auto& a) { return read(a)[1]; }),
-                    element([&](const auto& a) { return read(a)[2]; })};
+        float field[20 * LANES];
+        const bool looked_up = looks.shape[0] > 0;
+        int own_of[LANES];
+        istore(own_of, own);
+        const int different = alone && !looked_up ? 1 : LANES;
+        SLOWLY for (int l = 0; l < different; ++l) {
+            auto fill = [&](const auto& look) {
+                for (int k = 0; k < 3; ++k) {
+                    field[k * LANES + l] = look.base_color[k];
+                    field[(3 + k) * LANES + l] = look.f0[k];
+                    field[(6 + k) * LANES + l] = look.f90[k];
+                    field[(9 + k) * LANES + l] = look.emissive[k];
+                }
+                field[12 * LANES + l] = look.roughness;
+                field[13 * LANES + l] = look.clearcoat;
+                field[14 * LANES + l] = look.clearcoat_roughness;
+                field[15 * LANES + l] = look.clearcoat_f0;
+                field[16 * LANES + l] = look.opacity;
+                field[17 * LANES + l] = look.transmission;
             };
-            base_color = vector_of([](const auto& a) { return a.base_color; });
-            f0 = vector_of([](const auto& a) { return a.f0; });
-            f90 = vector_of([](const auto& a) { return a.f90; });
-            emissive = vector_of([](const auto& a) { return a.emissive; });
-            roughness = element([](const auto& a) { return a.roughness; });
-            clearcoat = element([](const auto& a) { return a.clearcoat; });
-            clearcoat_roughness = element([](const auto& a) { return a.clearcoat_roughness; });
-            clearcoat_f0 = element([](const auto& a) { return a.clearcoat_f0; });
-            opacity = element([](const auto& a) { return a.opacity; });
-            through = element([](const auto& a) { return a.transmission; });
-        };
-        const auto* materials = scene.materials.data;
-        auto of_material = [&](auto read) -> F {
-            if (alone) return F(read(materials[material[0]]));
-            F value;
-            EACH_LANE value[l] = read(materials[material[l]]);
-            return value;
-        };
-        if (looks.shape[0] > 0) {
-            look_of([&](auto read) -> F { F value; EACH_LANE value[l] = read(looks.data[own[l]]); return value; });
-        } else {
-            look_of(of_material);
+            if (looked_up) {
+                fill(looks.data[own_of[l]]);
+                continue;
+            }
+            const auto& material = scene.materials.data[material_of[l]];
+            fill(material);
+            field[18 * LANES + l] = material.metallic;
+            field[19 * LANES + l] = (float)material.uses_vertex_color;
         }
+        if (different == 1) SLOWLY for (int k = 0; k < 20; ++k) store(field + k * LANES, F(field[k * LANES]));
+        auto vector_at = [&](int k) -> V {
+            return V{load(field + k * LANES), load(field + (k + 1) * LANES), load(field + (k + 2) * LANES)};
+        };
+        V base_color = vector_at(0), f0 = vector_at(3), f90 = vector_at(6);
+        const V emissive = vector_at(9);
+        const F roughness = load(field + 12 * LANES), clearcoat = load(field + 13 * LANES);
+        const F clearcoat_roughness = load(field + 14 * LANES), clearcoat_f0 = load(field + 15 * LANES);
+        const F opacity = load(field + 16 * LANES), through = load(field + 17 * LANES);
         if (colored) {
             const int* color_index = (const int*)scene.color_index.data;
             const I first_color = igather(color_index, 3 * tri);
-            const F uses = of_material([](const auto& a) { return (float)a.uses_vertex_color; });
+            const F uses = load(field + 19 * LANES);
             const I has = (first_color >= 0) & (uses != 0.0f);
             if (bits(seen & has)) {
                 const float* all = (const float*)scene.colors.data;
@@ -199,7 +213,7 @@ _SHADING = r"""
                 const V c2 = vgather(all, ipick(has, igather(color_index, 3 * tri + 2), I(0)));
                 const V mixed = add(add(times(w, c0), times(u, c1)), times(v, c2));
                 base_color = vpick(has, mixed, base_color);
-                const F metallic = of_material([](const auto& a) { return a.metallic; });
+                const F metallic = load(field + 18 * LANES);
                 const I metal = has & (metallic > 0.0f);
                 const V tint = times(metallic, mixed);
                 f0 = vpick(metal, add(grey((1.0f - metallic) * clearcoat_f0), tint), f0);
@@ -262,46 +276,54 @@ _SHADING = r"""
         result.mirror = times(opacity, mirror);
         return result;
     };
-    auto put = [](float* p, V a, int l) { p[0] = a.x[l]; p[1] = a.y[l]; p[2] = a.z[l]; };
-"""
-
-_EYE = r"""
+    const bool parallel = camera.orthographic != 0;
     float* picture = (float*)out_picture.data;
     float* mirror = (float*)out_mirror.data;
+    float* radiance = (float*)out_radiance.data;
     for (int start = begin; start < end; start += LANES) {
         const I element = start + lanes();
         const I own = ipick(element < end, element, I(end - 1));
         const I tri = igather(triangle.data, own);
-        const I reflector = igather(reflector_id.data, own) > 0;
-        const int first_row = start / camera.width;
-        const bool one_row = own[LANES - 1] < (first_row + 1) * camera.width;
-        const I row = one_row ? I(first_row) : own / camera.width;
-        const F x = __builtin_convertvector(own - row * camera.width, F) + 0.5f;
-        const F y = __builtin_convertvector(row, F) + 0.5f;
-        const V plane = add(add(spread(camera.ray_corner), times(x, spread(camera.ray_dx))), times(y, spread(camera.ray_dy)));
-        const bool parallel = camera.orthographic != 0;
-        const V ray = parallel ? spread(camera.forward) : plane;
-        const V incident = unit(ray);
         const I seen = tri >= 0;
+        I reflector = I(0);
+        V plane, ray, incident;
+        if (of_eye != 0) {
+            reflector = igather(reflector_id.data, own) > 0;
+            const int first_row = start / camera.width;
+            const bool one_row = own[LANES - 1] < (first_row + 1) * camera.width;
+            const I row = one_row ? I(first_row) : own / camera.width;
+            const F x = __builtin_convertvector(own - row * camera.width, F) + 0.5f;
+            const F y = __builtin_convertvector(row, F) + 0.5f;
+            plane = add(add(spread(camera.ray_corner), times(x, spread(camera.ray_dx))), times(y, spread(camera.ray_dy)));
+            ray = parallel ? spread(camera.forward) : plane;
+            incident = unit(ray);
+        } else {
+            plane = ray = incident = vgather((const float*)direction.data, own);
+        }
+        auto weights = [&](V p0, V p1, V p2, F& u, F& v) {
+            if (of_eye == 0) {
+                u = gather(weight_u.data, own);
+                v = gather(weight_v.data, own);
+                return;
+            }
+            // shade.weights_seen
+            const V eye = spread(camera.eye);
+            V a = sub(p0, eye), b = sub(p1, eye), c = sub(p2, eye);
+            if (parallel) { a = sub(a, plane); b = sub(b, plane); c = sub(c, plane); }
+            const F eu = dot(cross(sub(c, a), add(c, a)), ray);
+            const F ev = dot(cross(sub(a, b), add(a, b)), ray);
+            const F ew = dot(cross(sub(b, c), add(b, c)), ray);
+            const F det = eu + ev + ew;
+            const F inv = 1.0f / det;
+            const F cu = pick(det != 0.0f, fmax(eu * inv, F(0.0f)), F(0.0f));
+            const F cv = pick(det != 0.0f, fmax(ev * inv, F(0.0f)), F(0.0f));
+            const F total = cu + cv;
+            u = pick(total > 1.0f, cu / total, cu);
+            v = pick(total > 1.0f, cv / total, cv);
+        };
         Lit shown = Lit{same(0.0f), same(1.0f)};
         V onward = incident;
         if (bits(seen)) {
-            // shade.weights_seen
-            auto weights = [&](V p0, V p1, V p2, F& u, F& v) {
-                const V eye = spread(camera.eye);
-                V a = sub(p0, eye), b = sub(p1, eye), c = sub(p2, eye);
-                if (parallel) { a = sub(a, plane); b = sub(b, plane); c = sub(c, plane); }
-                const F eu = dot(cross(sub(c, a), add(c, a)), ray);
-                const F ev = dot(cross(sub(a, b), add(a, b)), ray);
-                const F ew = dot(cross(sub(b, c), add(b, c)), ray);
-                const F det = eu + ev + ew;
-                const F inv = 1.0f / det;
-                const F cu = pick(det != 0.0f, fmax(eu * inv, F(0.0f)), F(0.0f));
-                const F cv = pick(det != 0.0f, fmax(ev * inv, F(0.0f)), F(0.0f));
-                const F total = cu + cv;
-                u = pick(total > 1.0f, cu / total, cu);
-                v = pick(total > 1.0f, cv / total, cv);
-            };
             V reflected;
             const Lit found = lit(seen, own, ipick(seen, tri, I(0)), incident, reflector, weights, reflected);
             shown = Lit{vpick(seen, found.base, shown.base), vpick(seen, found.mirror, shown.mirror)};
@@ -310,46 +332,29 @@ _EYE = r"""
         const I dome = ~reflector & (size(shown.mirror) > 0.0f);
         V base = shown.base;
         if (bits(dome)) base = vpick(dome, add(base, product(shown.mirror, dome_radiance(dome, onward))), base);
+        // Three or four floats a lane, turned into rows by way of the stack.
+        float rows[7 * LANES];
+        store(rows, base.x); store(rows + LANES, base.y); store(rows + 2 * LANES, base.z);
+        const int whole = end - start < LANES ? end - start : LANES;
+        if (of_eye == 0) {
+            SLOWLY for (int l = 0; l < whole; ++l)
+                for (int k = 0; k < 3; ++k) radiance[3 * (start + l) + k] = rows[k * LANES + l];
+            continue;
+        }
         const V weight = vpick(reflector, shown.mirror, same(0.0f));
-        const F coverage = pick(seen, F(1.0f), F(0.0f));
-        const int whole = end - start < LANES ? end - start : LANES;
-        for (int l = 0; l < whole; ++l) {
-            put(picture + 4 * (start + l), base, l);
-            picture[4 * (start + l) + 3] = coverage[l];
-            put(mirror + 3 * (start + l), weight, l);
+        store(rows + 3 * LANES, pick(seen, F(1.0f), F(0.0f)));
+        store(rows + 4 * LANES, weight.x); store(rows + 5 * LANES, weight.y); store(rows + 6 * LANES, weight.z);
+        SLOWLY for (int l = 0; l < whole; ++l) {
+            for (int k = 0; k < 4; ++k) picture[4 * (start + l) + k] = rows[k * LANES + l];
+            for (int k = 0; k < 3; ++k) mirror[3 * (start + l) + k] = rows[(4 + k) * LANES + l];
         }
     }
 """
-
-_MIRROR = r"""
-    float* radiance = (float*)out_radiance.data;
-    for (int start = begin; start < end; start += LANES) {
-        const I element = start + lanes();
-        const I own = ipick(element < end, element, I(end - 1));
-        const I tri = igather(triangle.data, own);
-        const V ray = vgather((const float*)direction.data, own);
-        const I seen = tri >= 0;
-        Lit shown = Lit{same(0.0f), same(1.0f)};
-        V onward = ray;
-        if (bits(seen)) {
-            auto weights = [&](V, V, V, F& u, F& v) { u = gather(weight_u.data, own); v = gather(weight_v.data, own); };
-            V reflected;
-            const Lit found = lit(seen, own, ipick(seen, tri, I(0)), ray, I(0), weights, reflected);
-            shown = Lit{vpick(seen, found.base, shown.base), vpick(seen, found.mirror, shown.mirror)};
-            onward = vpick(seen, reflected, onward);
-        }
-        const I dome = size(shown.mirror) > 0.0f;
-        V base = shown.base;
-        if (bits(dome)) base = vpick(dome, add(base, product(shown.mirror, dome_radiance(dome, onward))), base);
-        const int whole = end - start < LANES ? end - start : LANES;
-        for (int l = 0; l < whole; ++l) put(radiance + 3 * (start + l), base, l);
-    }
-"""
-
-
-@wp.func_native(vector.snippet(_SHADING + _EYE))
+    )
+)
 def shade_block(
     block: int,
+    of_eye: int,
     scene: SceneView,
     records: wp.array(dtype=float),
     camera: CameraView,
@@ -363,28 +368,11 @@ def shade_block(
     rough_roughness: float,
     triangle: wp.array(dtype=int),
     reflector_id: wp.array(dtype=int),
-    out_picture: wp.array(dtype=wp.vec4),
-    out_mirror: wp.array(dtype=wp.vec3),
-): ...
-
-
-@wp.func_native(vector.snippet(_SHADING + _MIRROR))
-def seen_block(
-    block: int,
-    scene: SceneView,
-    records: wp.array(dtype=float),
-    lights: LightView,
-    areas: wp.array(dtype=AreaView),
-    looks: wp.array(dtype=Look),
-    normals: wp.array(dtype=wp.vec3),
-    direct: wp.array(dtype=wp.vec3),
-    sky: wp.array(dtype=float),
-    sharp_roughness: float,
-    rough_roughness: float,
     direction: wp.array(dtype=wp.vec3),
-    triangle: wp.array(dtype=int),
     weight_u: wp.array(dtype=float),
     weight_v: wp.array(dtype=float),
+    out_picture: wp.array(dtype=wp.vec4),
+    out_mirror: wp.array(dtype=wp.vec3),
     out_radiance: wp.array(dtype=wp.vec3),
 ): ...
 
@@ -392,6 +380,7 @@ def seen_block(
 @wp.kernel
 def shade_blocks_kernel(
     first: int,
+    of_eye: int,
     scene: SceneView,
     records: wp.array(dtype=float),
     camera: CameraView,
@@ -405,13 +394,18 @@ def shade_blocks_kernel(
     rough_roughness: float,
     triangle: wp.array(dtype=int),
     reflector_id: wp.array(dtype=int),
+    direction: wp.array(dtype=wp.vec3),
+    weight_u: wp.array(dtype=float),
+    weight_v: wp.array(dtype=float),
     # Outputs:
     out_picture: wp.array(dtype=wp.vec4),
     out_mirror: wp.array(dtype=wp.vec3),
+    out_radiance: wp.array(dtype=wp.vec3),
 ):
-    """One thread per block of pixels; as `shade.shade_kernel`."""
+    """One thread per block of pixels that the eye sees, or of rays, whose arrays are then those of length 0."""
     shade_block(
         first + wp.tid(),
+        of_eye,
         scene,
         records,
         camera,
@@ -425,46 +419,47 @@ def shade_blocks_kernel(
         rough_roughness,
         triangle,
         reflector_id,
-        out_picture,
-        out_mirror,
-    )
-
-
-@wp.kernel
-def seen_blocks_kernel(
-    first: int,
-    scene: SceneView,
-    records: wp.array(dtype=float),
-    lights: LightView,
-    areas: wp.array(dtype=AreaView),
-    looks: wp.array(dtype=Look),
-    normals: wp.array(dtype=wp.vec3),
-    direct: wp.array(dtype=wp.vec3),
-    sky: wp.array(dtype=float),
-    sharp_roughness: float,
-    rough_roughness: float,
-    direction: wp.array(dtype=wp.vec3),
-    triangle: wp.array(dtype=int),
-    weight_u: wp.array(dtype=float),
-    weight_v: wp.array(dtype=float),
-    out_radiance: wp.array(dtype=wp.vec3),
-):
-    """One thread per block of mirror pixels; as `shade.seen_radiance_kernel`."""
-    seen_block(
-        first + wp.tid(),
-        scene,
-        records,
-        lights,
-        areas,
-        looks,
-        normals,
-        direct,
-        sky,
-        sharp_roughness,
-        rough_roughness,
         direction,
-        triangle,
         weight_u,
         weight_v,
+        out_picture,
+        out_mirror,
         out_radiance,
     )
+
+
+def _none(dtype, device) -> wp.array:
+    return wp.empty(0, dtype=dtype, device=device)
+
+
+def shade_eye(scene: Scene, gbuffer: GBuffer, light: list, picture: wp.array, mirror: wp.array, threads: int) -> None:
+    """What `shade.shade_kernel` does.
+
+    Args:
+        light: Light, spheres to sum, looks, normals, direct irradiance, share of the sky, the two roughnesses.
+    """
+    device = scene.device
+    rays = [_none(wp.vec3, device), _none(float, device), _none(float, device)]
+    inputs = [
+        1,
+        scene.view,
+        scene.triangle_records,
+        gbuffer.view,
+        *light,
+        gbuffer.triangle,
+        gbuffer.reflector_id,
+        *rays,
+    ]
+    inputs += [picture, mirror, _none(wp.vec3, device)]
+    vector.launch_blocks(shade_blocks_kernel, len(gbuffer.triangle), inputs, device, threads)
+
+
+def shade_rays(
+    scene: Scene, gbuffer: GBuffer, layer: ReflectionLayer, light: list, radiance: wp.array, threads: int
+) -> None:
+    """What `shade.seen_radiance_kernel` does; `light` as in `shade_eye`."""
+    device = scene.device
+    rays = [layer.pixels.direction, layer.u, layer.v]
+    inputs = [0, scene.view, scene.triangle_records, gbuffer.view, *light, layer.triangle, _none(int, device), *rays]
+    inputs += [_none(wp.vec4, device), _none(wp.vec3, device), radiance]
+    vector.launch_blocks(shade_blocks_kernel, layer.pixels.count, inputs, device, threads)
