@@ -188,3 +188,35 @@ def test_threads_do_not_change_a_pixel():
     one, two = (rendered(world(BALLS), bounces=4, threads=threads) for threads in (1, 2))
     np.testing.assert_array_equal(one["RGBA"], two["RGBA"])
     assert one.statistics == two.statistics
+
+
+@pytest.mark.parametrize("method", ["planar", "quadric"])
+def test_flat_mirror_solves_what_it_shows_from_the_eye_behind_it(method):
+    """Two facing walls and a ball between them: pictures from the mirrored eye against rays, and against the tracer."""
+    objects = [*WALLS, ("ball", (-0.3, -0.2, -0.8), 0.4, silver(0.8))]
+    scene = world(objects)
+    forward, traced = (rendered(scene, method=how, bounces=3) for how in (method, "reference"))
+    solved = {row.path: row.effects["second_bounce"].numbers.get("solved") for row in forward.plan.rows if row.pixels}
+    if method == "planar":
+        assert solved["/o0"] == {2: "planar"} and forward.statistics["mirrored_eye"] > 100
+        assert "/o1 by planar from the eye behind it" in str(forward.plan)
+        assert not any(solved.get(row.path) for row in forward.plan.rows if row.path == "/o3")
+    else:
+        assert solved["/o0"] == {3: "quadric"}
+    assert "mirrored_eye" not in traced.statistics
+    error = np.abs(forward["RGBA"] - traced["RGBA"]).max(axis=-1)
+    assert np.mean(error < 1e-4) > 0.998, np.sort(error.reshape(-1))[-20:]
+    pixels = some_pixels(forward)
+    got = forward["RGBA"][pixels[:, 0], pixels[:, 1], :3]
+    off = np.abs(got - wanted(objects, forward, pixels, 3)).max(axis=1)
+    assert np.sort(off)[-10] < 2e-4, np.sort(off)[-12:]
+
+
+def test_turned_rays_of_a_flat_mirror_are_traced():
+    """A rough flat mirror's jittered rays come from no mirrored eye."""
+    rough = dataclasses.replace(silver(0.9), roughness=0.1)
+    scene = world([("wall", -2.0, 3.0, rough), *WALLS[1:]])
+    settings = {"glossy": "accumulate", "glossy_samples": 2, "size": (64, 36)}
+    forward, traced = (rendered(scene, method=how, **settings) for how in ("planar", "reference"))
+    error = np.abs(forward["RGBA"] - traced["RGBA"]).max(axis=-1)
+    assert np.mean(error < 1e-3) > 0.99

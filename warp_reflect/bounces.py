@@ -19,7 +19,7 @@ from warp_reflect import bvh, launch, shade
 from warp_reflect.layers import GBuffer, MirrorPixels, ReflectionLayer, Reflector
 from warp_reflect.normal_maps import prepare_normals
 from warp_reflect.scene import SHAPE_NONE, Scene, SceneView
-from warp_reflect.settings import Technique
+from warp_reflect.settings import Status, Technique
 from warp_reflect.shade import LightView
 from warp_reflect.surface import hit_normal, polish, shown_normal
 from warp_reflect.textures import Look, plain_look, prepare_looks
@@ -127,6 +127,7 @@ def onward(
     met: Callable[[ReflectionLayer], wp.array],
     bounces: int,
     threads: int = 0,
+    forward: Callable[[ReflectionLayer, wp.array], None] | None = None,
 ) -> wp.array:
     """What a layer's rays see, with what the mirrors among it reflect.
 
@@ -139,6 +140,7 @@ def onward(
         met: The same of other rays.
         bounces: Reflections that are followed from there on.
         threads: CPU threads; 0: one per core.
+        forward: Answers some of the first rays that mirrors reflect, and leaves the status of others NONE; None: rays do.
 
     Returns:
         vec3 [n]; `seen` itself where no mirror is met. The layer's statistics get `bounced`: rays followed, and
@@ -170,10 +172,33 @@ def onward(
         pixel, box = taken(layer.pixels.pixel), layer.pixels.box
         pixels = MirrorPixels(layer.pixels.reflector, pixel, taken(point), taken(normal), taken(direction), box)
         layer = ReflectionLayer.empty(pixels, Technique.RAYTRACED, device)
-        bvh.trace_bounced(scene, layer, facet, bodies, threads)
+        if forward is not None and depth == 0:
+            forward(layer, facet)
+            _trace_others(scene, layer, facet, bodies, threads)
+            _count(first, **layer.statistics)
+        else:
+            bvh.trace_bounced(scene, layer, facet, bodies, threads)
         numbers = wp.array(index, dtype=int, device=device)
         launch.launch(add_bounce_kernel, len(going), [numbers, weight, domes, met(layer), total], device, threads)
     return total
+
+
+def _trace_others(scene: Scene, layer: ReflectionLayer, facet: wp.array, bodies: wp.array, threads: int) -> None:
+    """Trace the rays of a layer whose status is NONE."""
+    others = np.flatnonzero(layer.status.numpy() == int(Status.NONE))
+    if not len(others):
+        return
+    pixels = layer.pixels
+    some = [
+        wp.array(array.numpy()[others], dtype=array.dtype, device=scene.device)
+        for array in (pixels.pixel, pixels.point, pixels.normal, pixels.direction, facet)
+    ]
+    rest = ReflectionLayer.empty(MirrorPixels(pixels.reflector, *some[:4], pixels.box), layer.method, scene.device)
+    bvh.trace_bounced(scene, rest, some[4], bodies, threads)
+    for name in ("triangle", "u", "v", "distance", "status"):
+        host = getattr(layer, name).numpy()
+        host[others] = getattr(rest, name).numpy()
+        getattr(layer, name).assign(host)
 
 
 def _count(layer: ReflectionLayer, **numbers: int) -> None:

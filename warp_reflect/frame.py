@@ -10,7 +10,18 @@ from functools import cached_property
 import numpy as np
 import warp as wp
 
-from warp_reflect import __version__, bounces, images, motion, raster, shade, surface, transmission, waves
+from warp_reflect import (
+    __version__,
+    bounces,
+    images,
+    mirrored_eyes,
+    motion,
+    raster,
+    shade,
+    surface,
+    transmission,
+    waves,
+)
 from warp_reflect.channels import CHANNELS, POINTS, component_of, known_names, reflection_channels
 from warp_reflect.choice import Spent
 from warp_reflect.effects import FINISHES, PANE_FINISHES, finish_of, moves_with_time
@@ -252,7 +263,7 @@ def render_frame(scene: Scene, plan: Plan, camera: str | Camera | None = None, p
     else:
         interfaces = _interfaces(scene, plan)
         with timer("shade"):
-            shown, met = _shown(scene, plan, gbuffer, interfaces)
+            shown, met = _shown(scene, plan, gbuffer, interfaces, layers)
             finish = _finish(scene, plan)
             picture = shade.shade(
                 scene, gbuffer, layers, settings.threads, plan.shadows, finish, shown, settings.kernels
@@ -319,7 +330,11 @@ def _interfaces(scene: Scene, plan: Plan) -> transmission.Interfaces | None:
 
 
 def _shown(
-    scene: Scene, plan: Plan, gbuffer: GBuffer, interfaces: transmission.Interfaces | None
+    scene: Scene,
+    plan: Plan,
+    gbuffer: GBuffer,
+    interfaces: transmission.Interfaces | None,
+    layers: dict[int, ReflectionLayer],
 ) -> tuple[shade.Shown, transmission.Met]:
     """What the eye sees, with the waves on it; how rays see mirrors and, in the former alone, through surfaces."""
     threads = plan.settings.threads
@@ -331,7 +346,7 @@ def _shown(
         asked = {k: finish_of(scene.data.materials[scene.parts[k].material], each) for k, each in wavy.items()}
         normals = waves.wave_normals(scene, gbuffer, shown.normals, asked, threads)
         shown = dataclasses.replace(shown, normals=normals)
-    met = _met(scene, plan, shown, interfaces)
+    met = _met(scene, plan, shown, interfaces, layers)
     if interfaces is None:
         return dataclasses.replace(shown, seen=met), met
 
@@ -344,7 +359,13 @@ def _shown(
     return dataclasses.replace(shown, seen=seen), met
 
 
-def _met(scene: Scene, plan: Plan, shown: shade.Shown, interfaces: transmission.Interfaces | None) -> transmission.Met:
+def _met(
+    scene: Scene,
+    plan: Plan,
+    shown: shade.Shown,
+    interfaces: transmission.Interfaces | None,
+    layers: dict[int, ReflectionLayer],
+) -> transmission.Met:
     """The radiance of what a layer's rays meet, with what the mirrors among that reflect where the plan asks for it."""
     settings, plain = plan.settings, shown.seen
     left = {row.reflector.id: settings.bounces - 1 for row in plan.rows if row.effects["second_bounce"].on}
@@ -352,6 +373,7 @@ def _met(scene: Scene, plan: Plan, shown: shade.Shown, interfaces: transmission.
         left[NO_REFLECTOR] = settings.bounces
     if not left:
         return plain
+    solved = {row.reflector.id for row in plan.rows if row.effects["second_bounce"].numbers.get("solved")}
     bodies = bounces.mirror_bodies(scene, [row.reflector for row in plan.rows])
 
     def reflected(layer: ReflectionLayer) -> wp.array:
@@ -364,7 +386,11 @@ def _met(scene: Scene, plan: Plan, shown: shade.Shown, interfaces: transmission.
         radiance, follow = plain(layer), left.get(layer.pixels.reflector, 0)
         if layer.radiance is not None or not follow:
             return radiance
-        return bounces.onward(scene, shown.gbuffer, bodies, layer, radiance, reflected, follow, settings.threads)
+        forward, reflector = None, layer.pixels.reflector
+        if reflector in solved and layer is layers.get(reflector):  # not where a finish turned its rays
+            forward = mirrored_eyes.answers(scene, shown.gbuffer, plan, reflector)
+        ask = (scene, shown.gbuffer, bodies, layer, radiance, reflected, follow, settings.threads, forward)
+        return bounces.onward(*ask)
 
     return met
 

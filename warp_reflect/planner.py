@@ -7,7 +7,7 @@ import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from warp_reflect import __version__, applicable, calibration, choice, raster, transmission, vector
+from warp_reflect import __version__, applicable, calibration, choice, mirrored_eyes, raster, transmission, vector
 from warp_reflect.applicable import PREFERRED
 from warp_reflect.budget import BUILT_IN, Costs, fixed_ms, loss, predict
 from warp_reflect.effects import Effect, bounce_effect, finish_effects, pane_effects
@@ -106,6 +106,7 @@ class Plan:
     costs: Costs = BUILT_IN
     pace: choice.Pace = field(default_factory=choice.Pace)
     _prepared: dict[int, object] = field(default_factory=dict)
+    _prepared_in_mirrors: dict[tuple[int, str], object] = field(default_factory=dict)
     _ways: dict[int, list[choice.Option]] = field(default_factory=dict)
     _told: int = 0  # of the notes, the last: those of the request for an error or a time
 
@@ -151,8 +152,19 @@ class Plan:
         """(width, height) of the frames, in pixels."""
         return self.camera.size
 
-    def prepared(self, row: PlanRow) -> object:
-        """The technique's view-independent data of a reflector, made at first use."""
+    def prepared(self, row: PlanRow, technique: str | None = None) -> object:
+        """The view-independent data of a reflector, made at first use.
+
+        Args:
+            row: The reflector's.
+            technique: By which it is solved where a flat mirror shows it; None: the row's own.
+        """
+        if technique not in (None, row.technique):
+            key = row.reflector.id, technique
+            if key not in self._prepared_in_mirrors:
+                made = TECHNIQUES[technique].prepare(self.scene, row.reflector, row.settings)
+                self._prepared_in_mirrors[key] = made
+            return self._prepared_in_mirrors[key]
         if row.reflector.id not in self._prepared:
             technique = TECHNIQUES[row.technique]
             self._prepared[row.reflector.id] = technique.prepare(self.scene, row.reflector, row.settings)
@@ -335,8 +347,14 @@ def make_plan(
     alone = len(rows) == 1 and rows[0].reflector.convex
     for row in rows:
         visible = row.pixels > 0
-        mirrored = None if tried is None else tried.mirrored.get(row.reflector.part)
-        row.effects["second_bounce"] = bounce_effect(visible, alone, mirrored, settings)
+        shares = {} if tried is None else tried.mirrored.get(row.reflector.part, {})
+        bounce = bounce_effect(visible, alone, sum(shares.values()), settings)
+        if bounce.on:
+            solved = mirrored_eyes.solved_forward(scene, row, rows, shares, method, view, costs)
+            names = {other.reflector.id: other.name for other in rows}
+            how = [f"; {names[number]} by {technique} from the eye behind it" for number, technique in solved.items()]
+            bounce = Effect(True, bounce.reason + "".join(how), bounce.numbers | {"solved": solved})
+        row.effects["second_bounce"] = bounce
         row.effects["shadows"] = _shadows(lights, visible)
     panes = [_pane(scene, view, settings, k, pixels[k]) for k in clear]
     notes += _too_rough(scene, settings)

@@ -44,12 +44,12 @@ class Probe:
     Attributes:
         points: Those tried.
         count: Pixels, and pixels of mirrors, that they stand for.
-        mirrored: By part: share of its points that show another reflector, or itself.
+        mirrored: By part: the share of its points that shows each reflector's part, where any is shown.
     """
 
     points: Points
     count: int
-    mirrored: dict[int, float]
+    mirrored: dict[int, dict[int, float]]
 
 
 def preview(scene: Scene, camera: Camera, threads: int = 0) -> Preview:
@@ -85,11 +85,11 @@ def probe(scene: Scene, small: Preview, parts: list[int], threads: int = 0) -> P
     found = [_taken(points_of(scene, gbuffer, None, threads), np.flatnonzero(chosen & (triangle >= 0)))]
     count = float(np.count_nonzero(triangle >= 0))
     ids = dict(enumerate(parts, 1))
-    mirrored: dict[int, float] = {}
+    mirrored: dict[int, dict[int, float]] = {}
     pixels, _ = surface.mirror_pixels(scene, gbuffer, ids, threads)
-    is_mirror = np.zeros(max(len(scene.patch_shapes), 1), bool)
+    mirror_of_patch = np.full(max(len(scene.patch_shapes), 1), -1)
     for part in parts:
-        is_mirror[list(scene.parts[part].patches)] = True
+        mirror_of_patch[list(scene.parts[part].patches)] = part
     for number, part in ids.items():
         own = pixels[number]
         some = np.flatnonzero(chosen[own.pixel.numpy()])
@@ -98,7 +98,8 @@ def probe(scene: Scene, small: Preview, parts: list[int], threads: int = 0) -> P
         layer = ReflectionLayer.empty(own.select(some, number, width), Technique.RAYTRACED, scene.device)
         bvh.trace_pixels(scene, gbuffer, layer.pixels, layer, part, False, threads=threads)
         shown = layer.triangle.numpy()
-        mirrored[part] = float(is_mirror[scene.host_triangle_patch[shown[shown >= 0]]].sum()) / len(shown)
+        seen, times = np.unique(mirror_of_patch[scene.host_triangle_patch[shown[shown >= 0]]], return_counts=True)
+        mirrored[part] = {int(k): float(n) / len(shown) for k, n in zip(seen, times, strict=True) if k >= 0}
         found.append(_taken(points_of(scene, gbuffer, layer, threads), np.flatnonzero(shown >= 0)))
         count += own.count * float((shown >= 0).mean())
     return Probe(_joined(found, (width, height), scene.device), round(count * small.scale), mirrored)

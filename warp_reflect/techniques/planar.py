@@ -128,6 +128,12 @@ def prepare(scene: Scene, reflector: Reflector, settings: Settings) -> Prepared:
     return Prepared(replace(reflector, convex=True), plane_frame(*plane), exact=exact)
 
 
+def plane_of(scene: Scene, part: int) -> tuple[np.ndarray, np.ndarray]:
+    """(point [3], unit normal [3]) of the plane through a part of the scene, world."""
+    point, normal, _ = _plane(scene, scene.parts[part])
+    return point + scene.origin, normal
+
+
 def plane_frame(point: np.ndarray, normal: np.ndarray, size: float) -> np.ndarray:
     """float64 [4, 4]: the similarity that puts a plane at z = 0, its unit normal up, and `size` to 1."""
     # Any rotation that takes the normal to +z: rows are an orthonormal basis.
