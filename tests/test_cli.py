@@ -545,3 +545,15 @@ def test_warmup_knows_every_kernel_module():
     names = set(kernel_modules())
     assert {"warp_reflect.raster", "warp_reflect.techniques.refine_vector", "warp_reflect.finishes.glossy"} <= names
     assert not names & {"warp_reflect.cli", "warp_reflect.settings", "warp_reflect.planner"}
+
+
+def test_unknown_methods_are_told_the_nearest(capsys):
+    for wrong, right in (
+        ("quadrik", "quadric"),
+        ("raytrace", "raytraced"),
+        ("layered_environement", "layered_environment"),
+    ):
+        assert cli.main(["plan", "none.usda", "--method", wrong]) == 2
+        assert f"nearest: {right}" in capsys.readouterr().err
+    assert cli.main(["plan", "none.usda", "--method", "none"]) == 2
+    assert "--method" not in capsys.readouterr().err  # it is one; the stage is what is missing

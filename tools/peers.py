@@ -24,6 +24,7 @@ import argparse
 import contextlib
 import ctypes
 import dataclasses
+import importlib.util
 import json
 import statistics
 import sys
@@ -40,6 +41,7 @@ SHADOW_SAMPLES = 64
 LIGHTING = ("none", "lights", "all")  # which lights' shadows Mitsuba casts
 ENVIRONMENT_SIDE = 512  # pixels of a face of VTK's environment
 CONVERGED = 128  # samples a pixel of the pictures that others are measured against
+SCALAR_CONVERGED = 32  # where there is no vectorised variant
 LLVM = "llvm_ad_rgb"
 PATH_DEPTH = 3  # eye, mirror, surface, light
 
@@ -195,13 +197,14 @@ def times(stage: str, size: tuple[int, int], arguments, llvm: bool) -> list[dict
     import warp_reflect as wr
     from warp_reflect.images import write_png
 
-    scene, mirrors = diffuse_stage(stage, size) if llvm else (wr.load_stage(stage), set())
+    mitsuba = importlib.util.find_spec("mitsuba") is not None
+    scene, mirrors = diffuse_stage(stage, size) if mitsuba else (wr.load_stage(stage), set())
     base = wr.Settings(threads=arguments.threads, keep_static=False)
     first = wr.render_frame(scene, wr.make_plan(scene, size=size, settings=base, method="reference"))
     contenders = package_contenders(scene, size, base, first)
     judged = None
-    if llvm:
-        judged = mitsuba_contenders(scene, size, mirrors, first, arguments, contenders)
+    if mitsuba:
+        judged = mitsuba_contenders(scene, size, mirrors, first, arguments, contenders, llvm)
     if first.layers:
         embree = Embree.over(scene, first)
         if embree:
@@ -217,7 +220,7 @@ def times(stage: str, size: tuple[int, int], arguments, llvm: bool) -> list[dict
             contenders.append(
                 Contender("embree wavefront", "embreex, eye rays, NumPy, mirror rays", wave.trace, wave.agreement)
             )
-        vtk = EnvironmentMap.over(scene, first) if llvm else None
+        vtk = EnvironmentMap.over(scene, first) if mitsuba else None  # whose converter reads the scene
         if vtk:
             what = "one environment texture in PBR mirrors"
             contenders.append(Contender("vtk", what, vtk.run, quality=vtk.quality, picture=vtk.picture))
@@ -276,46 +279,42 @@ def package_contenders(scene, size, base, first) -> list[Contender]:
     return contenders
 
 
-def mitsuba_contenders(scene, size, mirrors, first, arguments, contenders: list[Contender]) -> np.ndarray:
-    """Adds Mitsuba's rows; returns the converged picture by the package's rays and lights."""
+def mitsuba_contenders(
+    scene, size, mirrors, first, arguments, contenders: list[Contender], llvm: bool
+) -> np.ndarray | None:
+    """Adds Mitsuba's rows; returns the converged picture by the package's rays and lights, None without LLVM."""
     import drjit as dr
     import mitsuba as mi
     import mitsuba_scene
 
     data, camera, samples = scene.data, scene.data.cameras[0], arguments.peer_samples
-    made = mitsuba_scene.convert(data, camera, size, mirrors)
-    judged = mitsuba_scene.direct_picture(made, CONVERGED, centred=True)
-    converged = {}
+    judged, converged = None, {}
     last: dict[str, np.ndarray] = {}
     counter = iter(range(1, 1 << 30))
+    if llvm:
+        made = mitsuba_scene.convert(data, camera, size, mirrors)
+        judged = mitsuba_scene.direct_picture(made, CONVERGED, centred=True)
+        if first.layers:
+            rays = MitsubaRays(scene, first)
+            what = f"{LLVM}, the mirror rays given"
+            contenders.append(Contender("mitsuba hits", what, lambda: (rays.trace(), None), rays.agreement))
 
-    if first.layers:
-        rays = MitsubaRays(scene, first)
-        contenders.append(
-            Contender("mitsuba hits", f"{LLVM}, the mirror rays given", lambda: (rays.trace(), None), rays.agreement)
-        )
+        def same_light():
+            start = time.perf_counter()
+            last["direct"] = mitsuba_scene.direct_picture(made, samples, centred=True, seed=next(counter))
+            return None, 1000.0 * (time.perf_counter() - start)
 
-    def same_light():
-        start = time.perf_counter()
-        last["direct"] = mitsuba_scene.direct_picture(made, samples, centred=True, seed=next(counter))
-        return None, 1000.0 * (time.perf_counter() - start)
-
-    contenders.append(
-        Contender(
-            "mitsuba direct",
-            f"{LLVM}, same rays and light, {samples} samples",
-            same_light,
-            picture=lambda: last["direct"],
-        )
-    )
-    for variant in (LLVM, "scalar_rgb"):
+        what = f"{LLVM}, same rays and light, {samples} samples"
+        contenders.append(Contender("mitsuba direct", what, same_light, picture=lambda: last["direct"]))
+    for variant in (LLVM, "scalar_rgb") if llvm else ("scalar_rgb",):
         if variant not in mi.variants():
             continue
         mi.set_variant(variant)
         own = mitsuba_scene.convert(data, camera, size, mirrors, samples, ideal=True)
         loaded = mi.load_dict(own.whole({"type": "path", "max_depth": PATH_DEPTH, "hide_emitters": False}))
-        if variant == LLVM:
-            converged["path"] = np.array(loaded.integrator().render(loaded, spp=CONVERGED))[..., :3]
+        if "path" not in converged:
+            spp = CONVERGED if variant == LLVM else SCALAR_CONVERGED
+            converged["path"] = np.array(loaded.integrator().render(loaded, spp=spp))[..., :3]
 
         def path(loaded=loaded, variant=variant):
             start = time.perf_counter()
@@ -334,7 +333,8 @@ def mitsuba_contenders(scene, size, mirrors, first, arguments, contenders: list[
                 picture=lambda variant=variant: last[variant],
             )
         )
-    mi.set_variant(LLVM)
+    if llvm:
+        mi.set_variant(LLVM)
     dr.set_thread_count(arguments.threads)
     return judged
 

@@ -6,6 +6,7 @@ Results go to standard output, notes and errors to standard error. Exit 0: done;
 
 from __future__ import annotations
 
+import difflib
 import json
 import os
 import sys
@@ -732,11 +733,14 @@ def _channel_names(text: str) -> list[str]:
 
 
 def _check_method(method: str) -> None:
+    from warp_reflect.planner import METHODS
     from warp_reflect.techniques import TECHNIQUES
 
-    valid = ["auto", "reference", *TECHNIQUES]
+    valid = [*METHODS, *TECHNIQUES]
     if method not in valid:
-        raise ValueError(f"--method: got '{method}', expected one of {', '.join(valid)}")
+        near = difflib.get_close_matches(method, valid, n=3, cutoff=0.4)
+        nearest = f"nearest: {', '.join(near)}; " if near else ""
+        raise ValueError(f"--method: got '{method}'; {nearest}expected one of {', '.join(valid)}")
 
 
 def _check_size_options(planned: PlanOptions) -> None:
