@@ -119,7 +119,7 @@ CASES = {
 }
 TEXTURED = {"normal_map"}  # its case takes a picture: test_bumps.py
 # Effects that launch no kernel of their own: they choose an argument of those that run anyway, or the frame they begin at.
-ARGUMENTS = {"collection", "warm_start", "refraction", "frost_fade"}
+ARGUMENTS = {"collection", "warm_start", "refraction", "frost_fade", "detail", "kept_map"}
 
 
 def scene_of(case, device):

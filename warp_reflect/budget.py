@@ -202,7 +202,7 @@ def map_blur_px(pixels: int, resolution: int) -> float:
 
 def _texels(technique: str, settings: Settings) -> int:
     resolution = {"reflector_map": settings.map_resolution}
-    resolution |= dict.fromkeys(("environment", "layered_environment"), settings.environment_resolution)
+    resolution |= {"environment": settings.environment_resolution, "layered_environment": settings.local_edge}
     return 6 * resolution.get(technique, 0) ** 2
 
 
@@ -267,7 +267,7 @@ def _error(work: Work, technique: str, settings: Settings) -> tuple[float, float
     if technique == "raytraced":
         return 0.0, 0.0
     if technique == "layered_environment":
-        return map_blur_px(work.pixels, settings.environment_resolution), 0.0
+        return map_blur_px(work.pixels, settings.local_edge), 0.0
     if technique == "environment":
         return work.parallax_px + map_blur_px(work.pixels, settings.environment_resolution), 0.0
     curved = technique != "planar"

@@ -7,7 +7,17 @@ import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from warp_reflect import __version__, applicable, calibration, choice, mirrored_eyes, raster, transmission, vector
+from warp_reflect import (
+    __version__,
+    applicable,
+    calibration,
+    choice,
+    detail,
+    mirrored_eyes,
+    raster,
+    transmission,
+    vector,
+)
 from warp_reflect.applicable import PREFERRED
 from warp_reflect.budget import BUILT_IN, Costs, fixed_ms, loss, predict
 from warp_reflect.effects import Effect, bounce_effect, finish_effects, pane_effects
@@ -360,9 +370,43 @@ def make_plan(
     notes += _too_rough(scene, settings)
     if settings.kernels != "plain" and not scene.device.is_cuda and vector.missing():
         notes.append(Note("", f"plain kernels only: {vector.missing()} (kernels={settings.kernels})"))
+    rows = _with_detail(scene, view, settings, rows, earlier, costs)
     made = Plan(scene, view, settings, method, rows, panes, notes, lights, costs)
     _fit(made, choice.Pace() if earlier is None else earlier.pace)
     _take_over(made, earlier)
+    return made
+
+
+def _with_detail(scene, camera, settings, rows: list[PlanRow], earlier: Plan | None, costs) -> list[PlanRow]:
+    """The rows with the resolution of their local maps, and why."""
+    mapped = [row for row in rows if row.technique == "layered_environment" and row.pixels]
+    for row in rows:
+        seen = "only local maps have one" if row.pixels else "not seen from the camera"
+        row.effects["detail"] = row.effects["kept_map"] = Effect(False, seen)
+    for row in mapped:
+        kept = settings.local_keep_px
+        told = f"while what it holds has shifted by less than {kept:g} texels in the mean (local_keep_px)"
+        row.effects["kept_map"] = Effect(
+            kept > 0.0, told if kept > 0.0 else "made anew where it moves, local_keep_px=0"
+        )
+    if not (settings.local_detail or settings.local_texels) or settings.max_error_px or settings.budget_ms:
+        asked = settings.max_error_px or settings.budget_ms
+        why = "a request for an error or a time decides" if asked else "local_detail=0, local_texels=0"
+        for row in mapped:
+            row.effects["detail"] = Effect(False, why)
+        return rows
+    sizes = {row.reflector.id: detail.size_px(scene, camera, row.reflector.part) for row in mapped}
+    known = earlier.rows if earlier is not None and earlier.settings == settings else []
+    before = {row.reflector.id: row.settings.local_edge for row in known if row.effects["detail"].on}
+    found, made = detail.details(sizes, settings, before), []
+    for row in rows:
+        if row.reflector.id in found:
+            level = found[row.reflector.id]
+            row.effects["detail"] = Effect(True, level.reason, level.numbers)
+            own = row.settings.replace(local_resolution=level.resolution)
+            ask = (scene, row.reflector, camera, row.technique, row.pixels, own, costs)
+            row = dataclasses.replace(row, settings=own, predicted=_predicted(*ask))
+        made.append(row)
     return made
 
 

@@ -136,6 +136,14 @@ class Settings:
     """A cell whose corners' depths differ by more than this share of the nearest is refined; 0: every texel is traced."""
     parallax_steps: int = 12
     """Steps along a mirror pixel's ray at which a local map is asked what it meets; 0: looked up by direction alone."""
+    local_resolution: int = 0
+    """Texels along a cube edge of mirrors' local maps; 0: as many as reference maps have, `environment_resolution`."""
+    local_detail: float = 0.0
+    """Texels along an edge of a local map for each pixel of its mirror's size on screen; 0: all maps have as many."""
+    local_texels: int = 0
+    """Texels that the local maps of a frame have together at most, those finest for their size give first; 0: no limit."""
+    local_keep_px: float = 0.0
+    """A moving mirror's local map is kept while what it holds has shifted by less than this in the mean; 0: never. [texels]"""
     walk_hops: int = 4
     """Neighbour triangles a refinement may walk over before the BVH decides."""
     complexity: str = "low"
@@ -241,6 +249,11 @@ class Settings:
         _require(1 <= self.mesh_cells <= 4096, "mesh_cells", self.mesh_cells, "1 to 4096")
         _require(0.0 <= self.depth_ratio <= 1.0e6, "depth_ratio", self.depth_ratio, "0 (all texels) or a ratio")
         _require(0 <= self.parallax_steps <= 64, "parallax_steps", self.parallax_steps, "0 to 64")
+        texels = self.local_resolution
+        _require(texels == 0 or 4 <= texels <= 4096, "local_resolution", texels, "0 (as reference maps) or 4 to 4096")
+        _require(0.0 <= self.local_detail <= 64.0, "local_detail", self.local_detail, "0 (off) to 64 texels a pixel")
+        _require(0 <= self.local_texels <= 2**40, "local_texels", self.local_texels, "0 (no limit) or texels")
+        _require(0.0 <= self.local_keep_px <= 1.0e6, "local_keep_px", self.local_keep_px, "0 (never) or texels")
         for name in ("fade_distance", "frost_distance"):
             value = getattr(self, name)
             _require(0.0 <= value <= 1.0e9, name, value, "0 (off) or a length")
@@ -268,6 +281,11 @@ class Settings:
             "0 to 1",
         )
         _require(0.0 <= self.reflector_min_weight <= 1.0, "reflector_min_weight", self.reflector_min_weight, "0 to 1")
+
+    @property
+    def local_edge(self) -> int:
+        """Texels along a cube edge of mirrors' local maps."""
+        return self.local_resolution or self.environment_resolution
 
     @classmethod
     def names(cls) -> tuple[str, ...]:

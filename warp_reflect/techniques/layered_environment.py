@@ -16,6 +16,7 @@ import numpy as np
 import warp as wp
 
 from warp_reflect import bvh, launch
+from warp_reflect.cubemap import FACE_COUNT
 from warp_reflect.environment_maps import CubeMaps, CubeMapsView, Onward, fetch_radiance, nearest_texel
 from warp_reflect.layers import Camera, GBuffer, MirrorPixels, ReflectionLayer
 from warp_reflect.reflectors import mirror_weight
@@ -26,9 +27,7 @@ from warp_reflect.shapes import TriangleHit, clamp_weights, intersect_triangle, 
 from warp_reflect.techniques import local_map, local_movers, reference_maps
 from warp_reflect.techniques.environment import Shown, centre_of, onward_of
 from warp_reflect.techniques.local_movers import moving_in
-from warp_reflect.techniques.reference_maps import ReferenceMaps, take_over
-
-__all__ = ["applies", "plan_notes", "prepare", "reflect", "take_over"]
+from warp_reflect.techniques.reference_maps import ReferenceMaps
 
 wp.set_module_options({"enable_backward": False})
 
@@ -123,7 +122,7 @@ def _still_map(scene: Scene, part: int, settings: Settings) -> Prepared:
         start = perf_counter()
         intersect = intersect_still(scene, part, centre, settings.threads)
         mesh = local_map.trace_depth_mesh(
-            settings.environment_resolution,
+            settings.local_edge,
             intersect,
             settings.mesh_cells,
             settings.depth_ratio,
@@ -138,6 +137,40 @@ def _still_map(scene: Scene, part: int, settings: Settings) -> Prepared:
         statistics = mesh.statistics | statistics
         scene.environments[key] = Prepared(part, centre, references, local, state, mesh.cells, (), statistics, timings)
     return scene.environments[key]
+
+
+def take_over(earlier: Scene, scene: Scene) -> None:
+    """Hand over reference maps, and local maps that have moved little, to the same stage's scene at another time.
+
+    A pixel follows its own ray through a local map wherever that stands: what a map that stays behind lacks is what its place
+    does not see, or sees coarsely.
+    """
+    reference_maps.take_over(earlier, scene)
+    if earlier is scene or not reference_maps.same_numbers(earlier, scene):
+        return
+    for key, known in earlier.environments.items():
+        if key[0] != KEY or key in scene.environments or key[2].local_keep_px == 0.0:
+            continue
+        if reference_maps.known_maps(scene, key[2]) is None:
+            continue
+        shift = shift_px(known.local, centre_of(scene, key[1]))
+        if shift < key[2].local_keep_px:
+            local = known.local.at(scene)
+            local.view.triangle = known.local.view.triangle
+            statistics = known.statistics | {"local_kept": 1}
+            references = reference_maps.known_maps(scene, key[2])
+            scene.environments[key] = replace(
+                known, references=references, local=local, statistics=statistics, timings={}
+            )
+
+
+def shift_px(local: CubeMaps, centre: np.ndarray) -> float:
+    """By how many texels what a map holds is shifted, in the mean, as seen from another place; the sky by none."""
+    moved = float(np.linalg.norm(centre - local.centres[0]))
+    distance = local.view.distance.numpy()[: FACE_COUNT * local.resolution**2].astype(np.float64)
+    met = distance > 0.0
+    angle = np.arctan2(moved, distance[met]).sum() / len(distance)
+    return float(angle * local.resolution / (0.5 * np.pi))
 
 
 def _onward_of_still_maps(scene: Scene, parts: set[int], settings: Settings) -> Onward | None:

@@ -128,7 +128,7 @@ def take_over(earlier: Scene, scene: Scene) -> None:
     """Hand reference maps, and the structure for rays, to the same stage's scene at another time: nothing in them moves."""
     if earlier is scene or not same_lights(earlier, scene) or _still_prims(earlier) != _still_prims(scene):
         return
-    if _numbering(earlier) == _numbering(scene):
+    if same_numbers(earlier, scene):
         scene.keep_still_tracer(earlier)
     for key, known in earlier.environments.items():
         if key[0] == KEY and key not in scene.environments:
@@ -400,8 +400,15 @@ def _key(settings: Settings) -> tuple:
     return (KEY, *(getattr(settings, name) for name in names))
 
 
-def _numbering(scene: Scene) -> list[tuple[int, int]]:
-    return [(part.first_triangle, part.triangle_count) for part in scene.parts]
+def known_maps(scene: Scene, settings: Settings) -> ReferenceMaps | None:
+    """The stage's reference maps where they have been made."""
+    return scene.environments.get(_key(settings))
+
+
+def same_numbers(earlier: Scene, scene: Scene) -> bool:
+    """Whether triangles of two scenes of a stage that have the same number are the same ones, at other times."""
+    one, other = ([(part.first_triangle, part.triangle_count) for part in each.parts] for each in (earlier, scene))
+    return one == other
 
 
 def _still_prims(scene: Scene) -> list[tuple]:
