@@ -1,6 +1,7 @@
 """Vector kernels against the plain ones: the same bits, on every shape of triangle and on every scene."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from warp_reflect import raster, surface, vector
 from warp_reflect.layers import Camera, CameraView
 from warp_reflect.raster import make_target, rasterise
 from warp_reflect.scene import CameraData, InstanceData, LightData, MaterialData, Scene, SceneData
-from warp_reflect.techniques import quadric_patch
+from warp_reflect.techniques import quadric_patch, refine
 from warp_reflect.techniques.quadric_search import QuadricView
 from warp_reflect.techniques.vertices import SolveFrame, empty_vertices
 
@@ -303,3 +304,36 @@ def test_reflection_points_are_searched_as_the_plain_kernel_does(name):
             np.testing.assert_array_equal(vectors[field], plain[field], err_msg=field)
         for field, values in searched(body, points, eye, "vector", threads=2, seeds=start).items():
             np.testing.assert_array_equal(values, vectors[field], err_msg=field)
+
+
+def test_rays_are_put_in_doubt_by_coarse_triangles_as_the_plain_kernel_does():
+    """Rays before, behind, along and through corners and edges of triangles, some without area."""
+    scene = lit_room([])
+    rng = np.random.default_rng(4)
+    count, corners = 333, scene.host_points[scene.host_triangles].astype(np.float64)
+    coarse = rng.choice(len(corners), 48, replace=False).astype(np.int32)
+    at = coarse[rng.integers(0, 48, count)]
+    weights = rng.dirichlet((1.0, 1.0, 1.0), count)
+    weights[::5] = (1.0, 0.0, 0.0)
+    weights[1::5] = (0.5, 0.5, 0.0)
+    goal = np.einsum("nk,nkc->nc", weights, corners[at])
+    start = goal + rng.normal(size=(count, 3))
+    ray = (goal - start) / np.linalg.norm(goal - start, axis=1, keepdims=True) * rng.choice([-1.0, 1.0], (count, 1))
+    settled = rng.choice([0, 1, 2, 3], count).astype(np.uint8)
+    length = np.linalg.norm(goal - start, axis=1) * rng.choice([0.5, 1.0, 2.0], count)
+    triangle = np.where(settled == 3, -1, rng.choice([0, 5], count) + at * rng.integers(0, 2, count)) % len(corners)
+    triangle[settled == 3] = -1
+    layer = SimpleNamespace(
+        triangle=wp.array(triangle, dtype=int, device=CPU), distance=wp.array(length, dtype=float, device=CPU)
+    )
+    vectors = [wp.array(np.float32(each), dtype=wp.vec3, device=CPU) for each in (start, ray)]
+    marks = {}
+    for kernels, threads in (("plain", 1), ("vector", 1), ("vector", 2)):
+        marks[kernels, threads] = wp.array(settled, dtype=wp.uint8, device=CPU)
+        settings = wr.Settings(kernels=kernels, threads=threads)
+        chosen = wp.array(coarse, dtype=int, device=CPU)
+        refine.doubt_coarse(scene, chosen, *vectors, layer, marks[kernels, threads], settings)
+    plain = marks["plain", 1].numpy()
+    assert 30 < ((plain == 0) & (settled != 0)).sum() < (settled != 0).sum() - 30
+    np.testing.assert_array_equal(marks["vector", 1].numpy(), plain)
+    np.testing.assert_array_equal(marks["vector", 2].numpy(), plain)

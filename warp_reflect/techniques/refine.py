@@ -246,6 +246,24 @@ def coarse_kernel(
                 return
 
 
+def doubt_coarse(
+    scene: Scene,
+    coarse: wp.array,
+    point: wp.array,
+    direction: wp.array,
+    layer: ReflectionLayer,
+    settled: wp.array,
+    settings: Settings,
+) -> None:
+    """Set `settled` to DOUBT where a ray meets one of the triangles `coarse` before what the layer has for it."""
+    rays = [coarse, point, direction, layer.triangle, layer.distance]
+    if vector.chosen(settings.kernels, scene.device):
+        inputs = [scene.triangle_records, *rays, DOUBT, settled]
+        vector.launch_blocks(refine_vector.coarse_blocks_kernel, len(point), inputs, scene.device, settings.threads)
+    else:
+        launch(coarse_kernel, len(point), [scene.view, *rays, settled], scene.device, settings.threads)
+
+
 def _on_cut(scene: Scene, layer: ReflectionLayer) -> np.ndarray:
     """At which pixels a layer shows a triangle that may have holes, bool [pixels]; the scene has some."""
     triangle = layer.triangle.numpy()
@@ -300,8 +318,7 @@ def settle(
         inputs = [scene.view, scene.neighbours, scene.closed_patches, target.view, *picture, *how, *outputs]
         launch(settle_kernel, pixels.count, inputs, scene.device, settings.threads)
     if mesh.coarse is not None and len(mesh.coarse):
-        inputs = [scene.view, mesh.coarse, pixels.point, pixels.direction, layer.triangle, layer.distance, settled]
-        launch(coarse_kernel, pixels.count, inputs, scene.device, settings.threads)
+        doubt_coarse(scene, mesh.coarse, pixels.point, pixels.direction, layer, settled, settings)
     host = settled.numpy()
     if seen is not None:
         triangle = layer.triangle.numpy()

@@ -306,3 +306,73 @@ def settle_blocks_kernel(
         out_status,
         out_settled,
     )
+
+
+@wp.func_native(
+    vector.snippet(r"""
+    const int count = point.shape[0];
+    const int begin = block * BLOCK;
+    const int end = begin + BLOCK < count ? begin + BLOCK : count;
+    for (int start = begin; start < end; start += LANES) {
+        const I element = start + lanes();
+        const I valid = element < end;
+        const I own = ipick(valid, element, I(end - 1));
+        I known;
+        EACH_LANE known[l] = out_settled.data[own[l]];
+        I live = valid & (known != doubt);
+        const V origin = vgather((const float*)point.data, own), ray = vgather((const float*)direction.data, own);
+        const I found = igather(triangle.data, own);
+        const F nearest = gather(distance.data, own), ray_square = dot(ray, ray);
+        I doubtful = I(0);
+        for (int k = 0; k < coarse.shape[0] && bits(live); ++k) {
+            const int other = coarse.data[k];
+            const float* corner = records.data + 12 * other;
+            // shapes.intersect_triangle
+            const V a = sub(spread(corner), origin), b = sub(spread(corner + 3), origin), c = sub(spread(corner + 6), origin);
+            const F eu = dot(cross(sub(c, a), add(c, a)), ray);
+            const F ev = dot(cross(sub(a, b), add(a, b)), ray);
+            const F ew = dot(cross(sub(b, c), add(b, c)), ray);
+            const I inside = live & (found != other) & (((eu >= 0.0f) & (ev >= 0.0f) & (ew >= 0.0f))
+                | ((eu <= 0.0f) & (ev <= 0.0f) & (ew <= 0.0f)));
+            if (!bits(inside)) continue;
+            const F det = eu + ev + ew;
+            const F inv = 1.0f / det;
+            const F u = eu * inv, v = ev * inv, w = ew * inv;
+            const F t = (w * dot(a, ray) + u * dot(b, ray) + v * dot(c, ray)) / ray_square;
+            const I before = inside & (det != 0.0f) & (t > 0.0f) & ((found < 0) | (t < nearest));
+            doubtful |= before;
+            live &= ~before;
+        }
+        for (unsigned left = bits(doubtful); left != 0; left &= left - 1)
+            out_settled.data[start + __builtin_ctz(left)] = (unsigned char)doubt;
+    }
+""")
+)
+def coarse_block(
+    block: int,
+    records: wp.array(dtype=float),
+    coarse: wp.array(dtype=int),
+    point: wp.array(dtype=wp.vec3),
+    direction: wp.array(dtype=wp.vec3),
+    triangle: wp.array(dtype=int),
+    distance: wp.array(dtype=float),
+    doubt: int,
+    out_settled: wp.array(dtype=wp.uint8),
+): ...
+
+
+@wp.kernel
+def coarse_blocks_kernel(
+    first: int,
+    records: wp.array(dtype=float),
+    coarse: wp.array(dtype=int),
+    point: wp.array(dtype=wp.vec3),
+    direction: wp.array(dtype=wp.vec3),
+    triangle: wp.array(dtype=int),
+    distance: wp.array(dtype=float),
+    doubt: int,
+    # Outputs:
+    out_settled: wp.array(dtype=wp.uint8),
+):
+    """One thread per block of mirror pixels; as `refine.coarse_kernel`."""
+    coarse_block(first + wp.tid(), records, coarse, point, direction, triangle, distance, doubt, out_settled)
