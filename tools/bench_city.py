@@ -75,7 +75,7 @@ def measure(cars: int, folder: Path, size: tuple[int, int], frames: int, threads
 
 
 def flip(frame: wr.Frame, reference: wr.Frame) -> float:
-    """FLIP of two pictures, 0 is equal; in sRGB, as shown."""
+    """FLIP of two pictures, 0 is equal."""
     import flip_evaluator
 
     shown = [np.clip(each["RGBA"][..., :3], 0.0, 1.0).astype(np.float32) for each in (reference, frame)]

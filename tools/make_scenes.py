@@ -20,6 +20,7 @@ from pxr import Usd, UsdGeom, UsdValidation, Vt
 from scene_city import CITY_SCENES, LARGE_CITIES
 from scene_curved import CURVED_SCENES
 from scene_cut import CUT_SCENES
+from scene_gloss import GLOSS_SCENES
 from scene_parts import STAND_BEAD, STAND_RING
 from scene_sets import WALLS, arena, boxes, corner, play_room, play_things, studio
 from scene_shapes import Detail, block, merge, patch, revolve, sheet
@@ -437,6 +438,7 @@ SCENES = {
     **CUT_SCENES,
     **WATER_SCENES,
     **CITY_SCENES,
+    **GLOSS_SCENES,
 }
 
 

@@ -40,6 +40,7 @@ class Look:
     emissive: tuple[float, float, float] = (0.0, 0.0, 0.0)
     opacity: float = 1.0
     ior: float = 1.5
+    clearcoat: float = 0.0  # smooth
 
 
 LOOKS = {
@@ -49,6 +50,8 @@ LOOKS = {
     "PaintRed": Look((0.75, 0.22, 0.18), 1.0, 0.0),
     "PaintBlue": Look((0.25, 0.4, 0.75), 1.0, 0.0),
     "PaintGold": Look((0.85, 0.66, 0.3), 1.0, 0.0),
+    **{f"Polished{k}": Look((0.9, 0.9, 0.92), 1.0, 0.1 * k) for k in range(7)},
+    "CarPaint": Look((0.55, 0.06, 0.05), 0.85, 0.35, clearcoat=1.0),
     "Black": Look((0.02, 0.02, 0.022)),
     "White": Look((0.82, 0.81, 0.78)),
     "Cream": Look((0.78, 0.7, 0.55)),

@@ -200,10 +200,13 @@ def define_material(stage: Usd.Stage, path: Sdf.Path, look: Look) -> UsdShade.Ma
     number = Sdf.ValueTypeNames.Float
     shader.CreateInput("diffuseColor", color).Set(Gf.Vec3f(*look.color))
     shader.CreateInput("metallic", number).Set(look.metallic)
-    shader.CreateInput("roughness", number).Set(look.roughness)
+    shader.CreateInput("roughness", number).Set(round(look.roughness, 4))
     shader.CreateInput("ior", number).Set(look.ior)
     if look.opacity < 1.0:
         shader.CreateInput("opacity", number).Set(look.opacity)
+    if look.clearcoat > 0.0:
+        shader.CreateInput("clearcoat", number).Set(look.clearcoat)
+        shader.CreateInput("clearcoatRoughness", number).Set(0.0)
     if any(look.emissive):
         shader.CreateInput("emissiveColor", color).Set(Gf.Vec3f(*look.emissive))
     material.CreateSurfaceOutput().ConnectToSource(shader.CreateOutput("surface", Sdf.ValueTypeNames.Token))

@@ -21,15 +21,16 @@ def mirror_roughness(material: MaterialData) -> float:
 def mirror_weight(scene: Scene, part: PartRange, settings: Settings) -> float:
     """Luminance of a part's mirror term at normal incidence; 0 where it is no mirror, by choice or by the settings."""
     material = scene.data.materials[part.material]
+    most = float(np.float32(settings.reflector_max_roughness))  # as a stage stores it: 0.3 is rough 0.30000001
     f0, _ = reflectance(material)
     weight = float(f0 @ REC709_LUMINANCE)
     if material.mirror is not None:
         return weight if material.mirror.include else 0.0
-    coated = material.clearcoat >= CLEARCOAT_MIN and material.clearcoat_roughness <= settings.reflector_max_roughness
+    coated = material.clearcoat >= CLEARCOAT_MIN and material.clearcoat_roughness <= most
     if coated:
         return max(weight, CLEARCOAT_MIN)
     # What a mirror's picture has to stand out from is what the surface scatters; through clear glass nothing is.
     least = settings.reflector_min_weight * (1.0 - material.transmission)
-    if material.roughness <= settings.reflector_max_roughness and weight >= least:
+    if material.roughness <= most and weight >= least:
         return weight
     return 0.0
