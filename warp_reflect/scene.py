@@ -365,7 +365,7 @@ class Scene:
             for i, inst in enumerate(self.data.instances)
         }
 
-    @property
+    @cached_property
     def size(self) -> float:
         """Length of the diagonal of the bounds, in scene units."""
         if not self.vertex_count:

@@ -126,6 +126,9 @@ class Settings:
     """Texels of reference environment maps: `packed` (4 bytes) or `full` (20 bytes, single precision)."""
     rem_missing: str = "shade"
     """What no reference map sees is shaded where it is met (`shade`), or shows the map that would weigh most (`best`)."""
+    rem_blur_px: float = 64.0
+    """A reference map whose texel covers more texels of the local map than this does not count as seeing a point; 0: it does.
+    [texels of a local map]"""
     rem_limit: int = 16
     """Reference maps that are placed at most where the stage names no places."""
     rem_error_px: float = 1.0
@@ -244,6 +247,7 @@ class Settings:
         _require(1 <= self.rem_count <= 8, "rem_count", self.rem_count, "1 to 8")
         _require(self.rem_texels in REM_TEXELS, "rem_texels", self.rem_texels, f"one of {', '.join(REM_TEXELS)}")
         _require(self.rem_missing in REM_MISSING, "rem_missing", self.rem_missing, f"one of {', '.join(REM_MISSING)}")
+        _require(0.0 <= self.rem_blur_px <= 1.0e6, "rem_blur_px", self.rem_blur_px, "0 (off) or a number of texels")
         _require(1 <= self.rem_limit <= 1024, "rem_limit", self.rem_limit, "1 to 1024")
         _require(0.0 <= self.rem_error_px <= 1.0e6, "rem_error_px", self.rem_error_px, "a number of texels")
         _require(1 <= self.mesh_cells <= 4096, "mesh_cells", self.mesh_cells, "1 to 4096")

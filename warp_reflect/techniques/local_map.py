@@ -13,6 +13,8 @@ from it by:
   8 bits), so that a surface does not fail it against itself;
 * for more than two REMs the weights of Buehler et al., Unstructured Lumigraph Rendering, SIGGRAPH 2001, section 4.2;
 * a REM on the other side of a surface does not see it, however thin the wall;
+* a REM whose texel would cover many of the local map's texels at I (a street seen along it from afar) does not count as
+  seeing it, on demand;
 * what no REM sees can be shaded where it is met.
 """
 
@@ -275,6 +277,24 @@ def sees_point(maps: CubeMapsView, k: int, p: wp.vec3, normal: wp.vec3, slack: f
 
 
 @wp.func
+def blur(maps: CubeMapsView, k: int, p: wp.vec3, normal: wp.vec3, eye: wp.vec3, resolution: int) -> float:
+    """How many texels of the local map at `eye` a texel of map k covers at a point of a surface, along the worse direction.
+
+    A map that looks along a surface from afar holds little of what lies before the eye. Without a normal: by distance alone.
+    """
+    to_map = maps.centre[k] - p
+    to_eye = eye - p
+    far = wp.length(to_map)
+    near = wp.max(wp.length(to_eye), 1.0e-30)
+    ratio = far / near * float(resolution) / float(maps.resolution)
+    along_map = wp.abs(wp.dot(normal, to_map)) / wp.max(far, 1.0e-30)
+    along_eye = wp.abs(wp.dot(normal, to_eye)) / near
+    if along_map > 0.0:
+        ratio = ratio * wp.max(1.0, along_eye / along_map)
+    return ratio
+
+
+@wp.func
 def penalty(p: wp.vec3, eye: wp.vec3, centre: wp.vec3) -> float:
     """How badly a REM at `centre` stands in for `eye` at a point: angle between them, and how much farther it is."""
     a = eye - p
@@ -385,6 +405,7 @@ def blend_kernel(
     used: int,
     eye: wp.vec3,
     slack: float,
+    blur_max: float,
     resolution: int,
     index: wp.array(dtype=int),
     inverse: wp.array(dtype=float),
@@ -428,8 +449,9 @@ def blend_kernel(
     while k < asked:
         ray = p - maps.centre[rems[k]]
         if wp.dot(ray, ray) > AT_CENTRE * distance * distance and sees_point(maps, rems[k], p, normal, slack):
-            valid[k] = 1.0
-            any_valid = int(1)
+            if blur_max == 0.0 or blur(maps, rems[k], p, normal, eye, n) <= blur_max:
+                valid[k] = 1.0
+                any_valid = int(1)
         k += 1
     weights = rem_weights(maps, rems, used, eye, p, valid)
     total = wp.vec3(0.0, 0.0, 0.0)
@@ -539,7 +561,8 @@ def blend_local_map(
         local.view.triangle = wp.array(mesh.triangle.reshape(-1), dtype=int, device=device)
         inverse = wp.array(mesh.inverse.reshape(-1), dtype=float, device=device)
         index = wp.array(np.zeros(0, np.int32) if texels is None else texels, dtype=int, device=device)
-        inputs = [scene.view, scene.lights, maps.view, chosen, settings.rem_count, eye, float(slack), n, index]
+        inputs = [scene.view, scene.lights, maps.view, chosen, settings.rem_count, eye]
+        inputs += [float(slack), settings.rem_blur_px, n, index]
         inputs += [inverse, local.view.triangle, local.view.radiance, local.view.distance, state]
         launch.launch(blend_kernel, len(state) if texels is None else len(texels), inputs, device, threads)
 

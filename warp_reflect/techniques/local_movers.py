@@ -76,6 +76,9 @@ def draw_moving(
         (The map; the state of its texels; statistics `local_moving`: texels that show what moves).
     """
     movers = _movers(scene)
+    bits = (np.arange(8)[:, None] >> np.arange(3)) & 1
+    low, high = (np.array([box[part] for part in parts])[:, None] for box in (movers.low, movers.high))
+    corners = np.where(bits[None] == 1, high, low) - (local.centres[0] - scene.origin)
     n, device = local.resolution, scene.device
     made = copied_maps(local)
     distance, triangle = local.view.distance.numpy().copy(), local.view.triangle.numpy().copy()
@@ -83,8 +86,8 @@ def draw_moving(
     texels = []
     for face in range(FACE_COUNT):
         camera = face_camera(scene, local.centres[0], local.axes[0], face, n)
-        inside = [part for part in parts if _may_be_seen(movers, part, camera, scene.origin)]
-        if not inside:
+        inside = np.array(parts)[_may_be_seen(corners, camera)]
+        if not len(inside):
             continue
         found, met = _draw(scene, movers, camera, inside, settings)
         own = slice(face * n * n, (face + 1) * n * n)
@@ -126,19 +129,27 @@ def _movers(scene: Scene) -> Movers:
     return scene.environments[(KEY,)]
 
 
-def _may_be_seen(movers: Movers, part: int, camera: Camera, origin: np.ndarray) -> bool:
-    """Whether a part's box is not wholly beyond one of the planes of a face's camera."""
-    low, high = movers.low[part] + origin - camera.eye, movers.high[part] + origin - camera.eye
-    corners = np.stack(np.meshgrid(*zip(low, high, strict=True), indexing="ij"), axis=-1).reshape(-1, 3)
+def _may_be_seen(corners: np.ndarray, camera: Camera) -> np.ndarray:
+    """Which boxes are not wholly beyond one of the planes of a face's camera; corners from its eye, float64 [n, 8, 3]."""
     x, y, depth = (corners @ axis for axis in (camera.right, camera.up, camera.forward))
-    return not any((beyond > 0.0).all() for beyond in (-depth, x - depth, -x - depth, y - depth, -y - depth))
+    beyond = (-depth, x - depth, -x - depth, y - depth, -y - depth)
+    return ~np.any([(plane > 0.0).all(axis=1) for plane in beyond], axis=0)
 
 
 def _draw(scene: Scene, movers: Movers, camera: Camera, parts, settings: Settings) -> tuple[np.ndarray, np.ndarray]:
     """(triangle of the scene int [n n], -1 none; distance float32 likewise) of a face."""
-    ranges = [movers.ranges[part] for part in parts]
-    drawn = [(movers.triangles[first:end], movers.ids[first:end]) for first, end in ranges]
+    drawn = [(movers.triangles[first:end], movers.ids[first:end]) for first, end in _joined(movers, parts)]
     view = camera.view(scene)
     gbuffer = raster.draw_triangles(camera, view, movers.points, drawn, settings.threads, settings.kernels)
     _, distance = texel_hits(scene, gbuffer, settings.threads)
     return gbuffer.triangle.numpy(), distance.numpy()
+
+
+def _joined(movers: Movers, parts) -> list[tuple[int, int]]:
+    """Ranges of triangles of some parts, ascending; those that follow each other are one."""
+    joined: list[tuple[int, int]] = []
+    for first, end in sorted(movers.ranges[part] for part in parts):
+        if joined and joined[-1][1] == first:
+            first = joined.pop()[0]
+        joined.append((first, end))
+    return joined

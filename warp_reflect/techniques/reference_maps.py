@@ -151,12 +151,10 @@ def left_out(scene: Scene, centre: np.ndarray, settings: Settings) -> tuple[int,
     """The parts that a map at a place does not hold: those that move, and mirrors whose box the place is in."""
     p = centre - scene.origin
     gone = set(scene.moving_parts)
+    first, _, corners = scene.boxes
+    inside = set(first[((corners.min(axis=1) < p) & (p < corners.max(axis=1))).all(axis=1)].tolist())
     for k, part in enumerate(scene.parts):
-        if k in gone or not part.triangle_count or not mirror_weight(scene, part, settings):
-            continue
-        own = scene.host_triangles[part.first_triangle : part.first_triangle + part.triangle_count]
-        points = scene.host_points[own.reshape(-1)]
-        if (points.min(axis=0) < p).all() and (p < points.max(axis=0)).all():
+        if part.first_vertex in inside and part.triangle_count and mirror_weight(scene, part, settings):
             gone.add(k)
     return tuple(gone)
 
