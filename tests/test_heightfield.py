@@ -411,3 +411,16 @@ def test_arguments_that_cannot_be_are_refused(device):
         make_occupancy([(0, 0, 4)], None, (4, 4, 4), device=device)
     with pytest.raises(ValueError, match="spans"):
         make_occupancy([(0, 0, 0)], [(1.0, 0.5)], (4, 4, 4), device=device)
+
+
+def test_steep_rays_go_column_by_column_in_both_walks(device):
+    """They meet something before skipping pays; rays that graze skip."""
+    rng = np.random.default_rng(8)
+    field = make_heightfield(rng.uniform(0.0, 8.0, (256, 256)), device=device)
+    turn = rng.uniform(0.0, 2.0 * np.pi, 500)
+    origins = np.column_stack([rng.uniform(0.0, 256.0, (500, 2)), np.full(500, 9.0)])
+    for slope, same in ((1.0, True), (0.05, False)):
+        directions = np.column_stack([np.cos(turn), np.sin(turn), np.full(500, -slope)])
+        plain, skipping = (trace_heightfield(field, origins, directions, walk) for walk in ("cells", "hierarchy"))
+        assert_same(plain, skipping)
+        assert np.array_equal(plain.steps.numpy(), skipping.steps.numpy()) == same

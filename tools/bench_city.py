@@ -23,6 +23,7 @@ from warp_reflect import devices
 
 CARS = (15, 30)
 RESOLUTION = 128  # of every map, texels along a cube edge
+DETAIL = {"local_detail": 1.0, "local_texels": 200_000, "local_keep_px": 2.0}
 
 
 def contenders(common: dict) -> dict[str, tuple[str, dict]]:
@@ -31,6 +32,7 @@ def contenders(common: dict) -> dict[str, tuple[str, dict]]:
         "no reflection": ("none", common),
         "maps drawn anew in every frame": ("environment", common | {"environment_update": "frame"}),
         "local maps from reference maps": ("layered_environment", common),
+        "the same with level of detail": ("layered_environment", common | DETAIL),
         "every ray traced": ("reference", common),
     }
 
