@@ -32,9 +32,9 @@ BUDGET_MIN = 20000
 RELAX = 2.0  # factor of the tolerance per attempt to meet the budget
 RELAX_STEPS = 24  # 2^23 times the tolerance cuts nothing any more
 MEASURED_LENGTH = 2.0  # of a mirror's radius: the deviation of longer pieces says nothing about that of shorter ones
-# Pieces of a partly hidden triangle that are longer than this share of the mirror end in a straight line where the hidden
-# region's border is curved: what lies between is not drawn. Such triangles are asked for at every pixel (`refine.settle`).
-COARSE_SHARE = 0.25
+# Of the mirror's radius: longer pieces of a partly hidden triangle end in a straight line where the border of what is hidden
+# is curved, and what lies between is not drawn. Such triangles are asked for at every pixel (`refine.settle`).
+COARSE_SHARE = 1.0
 COARSE_MAX = 48  # of them at most, the largest first: a test costs 10 ns a pixel, a ray a few hundred
 BOX_MARGIN = wp.constant(8.0)  # pixels around a virtual triangle's straight picture that its bent one may reach
 
