@@ -59,8 +59,8 @@ def measure(cars: int, folder: Path, size: tuple[int, int], frames: int, threads
         previous[name] = wr.render_frame(scene, plans[name])
         rows[name][1].append(1e3 * (time.perf_counter() - start))
     for k in range(frames):
-        moved = scene.at(2.0 + k)
         for name in rows:
+            moved = scene.at(2.0 + k)  # one of its own: what a frame makes of its scene would be there for the next
             start = time.perf_counter()
             previous[name] = wr.render_frame(moved, plans[name], previous=previous[name])
             rows[name][0].append(1e3 * (time.perf_counter() - start))
