@@ -30,6 +30,9 @@ wp.set_module_options({"enable_backward": False})
     auto snap = [](float x) -> int { return (int)__builtin_floorf(x * 256.0f + 0.5f); };
     auto least = [](int p, int q) -> int { return p < q ? p : q; };
     auto most = [](int p, int q) -> int { return p > q ? p : q; };
+    // What is no finite number snaps to no pixel.
+    const float none = (a[0] + a[1] + a[2] + b[0] + b[1] + b[2] + c[0] + c[1] + c[2]) * 0.0f;
+    if (!(none == 0.0f)) return;
     const int xa = snap(a[0]), ya = snap(a[1]);
     int xb = snap(b[0]), yb = snap(b[1]), xc = snap(c[0]), yc = snap(c[1]);
     const float ka = a[2];
