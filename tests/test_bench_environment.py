@@ -31,7 +31,7 @@ def test_what_maps_hold_too_coarsely_is_shaded(bench):
     fine, coarse = (
         bench.measure(scene, part, references, settings.replace(rem_blur_px=blur), 1, 12.0) for blur in (2.0, 0.0)
     )
-    assert fine["angle_deg"] <= coarse["angle_deg"] and fine["flip"] < min(0.1, coarse["flip"])
+    assert fine["angle_deg"] <= coarse["angle_deg"] and fine["difference"] < min(0.02, coarse["difference"])
     assert fine["unseen"] > coarse["unseen"]
     assert 0.0 < fine["local_ms"] and 0.0 < fine["drawn_ms"] and fine["rays"] <= 6 * 32 * 32
 

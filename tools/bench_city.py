@@ -77,9 +77,11 @@ def measure(cars: int, folder: Path, size: tuple[int, int], frames: int, threads
 
 
 def flip(frame: wr.Frame, reference: wr.Frame) -> float:
-    """FLIP of two pictures, 0 is equal."""
-    import flip_evaluator
-
+    """FLIP of two pictures, 0 is equal; NaN where flip-evaluator is not installed."""
+    try:
+        import flip_evaluator
+    except ImportError:
+        return float("nan")
     shown = [np.clip(each["RGBA"][..., :3], 0.0, 1.0).astype(np.float32) for each in (reference, frame)]
     return float(flip_evaluator.evaluate(*shown, "LDR", inputsRGB=False, applyMagma=False)[1])
 

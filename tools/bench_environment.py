@@ -129,7 +129,8 @@ def measure(scene, part: int, references, settings, rounds: int, when: float) ->
         "local_ms": 1e3 * statistics.median(local[1:]),
         "drawn_ms": 1e3 * statistics.median(drawn[1:]),
         "angle_deg": float(np.median(angles(scene, made, references.maps, settings))),
-        "flip": flip(scene, made.local, whole),
+        "difference": float(np.abs(shown(made.local) - shown(whole)).mean()),
+        "flip": flip(shown(made.local), shown(whole)),
         "unseen": made.statistics["rem_missing"] / max(made.statistics["rem_texels"], 1),
         "rays": made.statistics["local_rays"],
         "timings": made.timings,
@@ -180,18 +181,21 @@ def texel_of(rays: np.ndarray, n: int) -> np.ndarray:
     return (face * n + row) * n + column
 
 
-def flip(scene, a, b) -> float:
-    """Mean flip between two maps, their faces one below the other, sky as the domes have it."""
-    from flip_evaluator import evaluate
+def shown(maps) -> np.ndarray:
+    """A map's faces one below the other in sRGB, sky as the domes have it."""
+    value = maps.radiance(0)
+    picture = value[..., :3] + (1.0 - value[..., 3:]) * 0.7
+    linear = np.clip(picture.reshape(-1, maps.resolution, 3), 0.0, 1.0)
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055).astype(np.float32)
 
-    pictures = []
-    for maps in (a, b):
-        value = maps.radiance(0)
-        picture = value[..., :3] + (1.0 - value[..., 3:]) * 0.7
-        linear = np.clip(picture.reshape(-1, maps.resolution, 3), 0.0, 1.0)
-        srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-        pictures.append(srgb.astype(np.float32))
-    return float(evaluate(pictures[1], pictures[0], "LDR", applyMagma=False, inputsRGB=True)[1])
+
+def flip(test: np.ndarray, reference: np.ndarray) -> float:
+    """Mean FLIP; NaN where flip-evaluator is not installed."""
+    try:
+        from flip_evaluator import evaluate
+    except ImportError:
+        return float("nan")
+    return float(evaluate(reference, test, "LDR", applyMagma=False, inputsRGB=True)[1])
 
 
 if __name__ == "__main__":
