@@ -103,7 +103,7 @@ def bench(stage: str, size: tuple[int, int], arguments) -> list[dict]:
     start = time.perf_counter()
     scene = wr.load_stage(stage, device=arguments.device)
     loaded = time.perf_counter() - start
-    base = wr.Settings(threads=arguments.threads, keep_static=False)
+    base = wr.Settings(threads=arguments.threads, keep_static=False, shadows="off")
     reference = wr.make_plan(scene, size=size, settings=base, method="reference")
     contenders = {
         "reference": (reference, False),
@@ -186,7 +186,7 @@ def walk(stage: str, size: tuple[int, int], arguments) -> list[dict]:
     start = time.perf_counter()
     scene = wr.load_stage(stage, device=arguments.device)
     loaded = 1000.0 * (time.perf_counter() - start)
-    base = wr.Settings(threads=arguments.threads, keep_static=False)
+    base = wr.Settings(threads=arguments.threads, keep_static=False, shadows="off")
     plans = {
         name: wr.make_plan(scene, size=size, settings=base, method=name) for name in (arguments.method, "reference")
     }
@@ -254,7 +254,7 @@ def slopes(stage: str, size: tuple[int, int], arguments) -> list[dict]:
     import warp_reflect as wr
 
     scene = wr.load_stage(stage, device=arguments.device)
-    base = wr.Settings(threads=arguments.threads, keep_static=False)
+    base = wr.Settings(threads=arguments.threads, keep_static=False, shadows="off")
     cases: dict[str, list[tuple[float, object, object]]] = {}
     methods = (arguments.method, "reference")
 

@@ -199,7 +199,7 @@ def times(stage: str, size: tuple[int, int], arguments, llvm: bool) -> list[dict
 
     mitsuba = importlib.util.find_spec("mitsuba") is not None
     scene, mirrors = diffuse_stage(stage, size) if mitsuba else (wr.load_stage(stage), set())
-    base = wr.Settings(threads=arguments.threads, keep_static=False)
+    base = wr.Settings(threads=arguments.threads, keep_static=False, shadows="off")
     first = wr.render_frame(scene, wr.make_plan(scene, size=size, settings=base, method="reference"))
     contenders = package_contenders(scene, size, base, first)
     judged = None
