@@ -16,7 +16,7 @@ import numpy as np
 import warp as wp
 
 from warp_reflect import bvh, launch, shade
-from warp_reflect.layers import GBuffer, MirrorPixels, ReflectionLayer, Reflector
+from warp_reflect.layers import GBuffer, MirrorPixels, ReflectionLayer, Reflector, add_statistics
 from warp_reflect.normal_maps import prepare_normals
 from warp_reflect.scene import SHAPE_NONE, Scene, SceneView
 from warp_reflect.settings import Status, Technique
@@ -162,9 +162,9 @@ def onward(
         if not len(going):
             break
         if depth == bounces:
-            _count(first, bounce_limit=len(going))
+            add_statistics(first.statistics, {"bounce_limit": len(going)})
             break
-        _count(first, bounced=len(going))
+        add_statistics(first.statistics, {"bounced": len(going)})
         if total is seen:
             total = wp.clone(seen)
         taken = lambda array: wp.array(array.numpy()[going], dtype=array.dtype, device=device)  # noqa: B023, E731
@@ -175,7 +175,7 @@ def onward(
         if forward is not None and depth == 0:
             forward(layer, facet)
             _trace_others(scene, layer, facet, bodies, threads)
-            _count(first, **layer.statistics)
+            add_statistics(first.statistics, layer.statistics)
         else:
             bvh.trace_bounced(scene, layer, facet, bodies, threads)
         numbers = wp.array(index, dtype=int, device=device)
@@ -199,8 +199,3 @@ def _trace_others(scene: Scene, layer: ReflectionLayer, facet: wp.array, bodies:
         host = getattr(layer, name).numpy()
         host[others] = getattr(rest, name).numpy()
         getattr(layer, name).assign(host)
-
-
-def _count(layer: ReflectionLayer, **numbers: int) -> None:
-    for name, value in numbers.items():
-        layer.statistics[name] = layer.statistics.get(name, 0) + value

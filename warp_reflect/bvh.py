@@ -128,6 +128,34 @@ def leaves_from_behind(
 
 
 @wp.func
+def exact_hit(
+    scene: SceneView, triangle: int, origin: wp.vec3, direction: wp.vec3, t: float, first: float, second: float
+) -> RayHit:
+    """What a ray meets at the triangle that a traversal found: by `intersect_triangle`, else as the traversal has it.
+
+    Args:
+        scene: Holds the triangle.
+        triangle: It.
+        origin, direction: Of the ray, before it was moved for the traversal.
+        t: Of the traversal.
+        first, second: The traversal's weights, which it names for the first and second corner.
+    """
+    tri = scene.triangles[triangle]
+    exact = intersect_triangle(origin, direction, scene.points[tri[0]], scene.points[tri[1]], scene.points[tri[2]])
+    result = RayHit()
+    result.triangle = triangle
+    result.status = HIT
+    result.t = t
+    weights = clamp_weights(second, 1.0 - first - second)
+    if exact.det != 0.0 and wp.min(wp.min(exact.u, exact.v), exact.w) > -0.01:
+        result.t = wp.max(exact.t, 0.0)
+        weights = clamp_weights(exact.u, exact.v)
+    result.u = weights[0]
+    result.v = weights[1]
+    return result
+
+
+@wp.func
 def trace_ray(
     mesh_id: wp.uint64,
     scene: SceneView,
@@ -192,21 +220,7 @@ def trace_ray(
                 elif not step_over:
                     step_over = leaves_from_behind(scene, triangle, t, d, normal, facet)
             if not step_over:
-                tri = scene.triangles[triangle]
-                exact = intersect_triangle(
-                    origin, direction, scene.points[tri[0]], scene.points[tri[1]], scene.points[tri[2]]
-                )
-                result.triangle = triangle
-                result.status = HIT
-                result.t = t
-                # The traversal names its weights for the first and second corner.
-                weights = clamp_weights(query.v, 1.0 - query.u - query.v)
-                if exact.det != 0.0 and wp.min(wp.min(exact.u, exact.v), exact.w) > -0.01:
-                    result.t = wp.max(exact.t, 0.0)
-                    weights = clamp_weights(exact.u, exact.v)
-                result.u = weights[0]
-                result.v = weights[1]
-                return result
+                return exact_hit(scene, triangle, origin, direction, t, query.u, query.v)
             t0 = t + wp.max(ray_offset(start + t * d), offset)
     result.status = STEP_LIMIT
     return result
@@ -398,18 +412,7 @@ def trace_onward(
                 else:
                     step_over = leaves and t <= OWN_FACET_REACH * longest
             if not step_over:
-                exact = intersect_triangle(origin, direction, a, b, c)
-                result.triangle = triangle
-                result.status = HIT
-                result.t = t
-                # The traversal names its weights for the first and second corner.
-                weights = clamp_weights(query.v, 1.0 - query.u - query.v)
-                if exact.det != 0.0 and wp.min(wp.min(exact.u, exact.v), exact.w) > -0.01:
-                    result.t = wp.max(exact.t, 0.0)
-                    weights = clamp_weights(exact.u, exact.v)
-                result.u = weights[0]
-                result.v = weights[1]
-                return result
+                return exact_hit(scene, triangle, origin, direction, t, query.u, query.v)
             t0 = t + wp.max(ray_offset(start + t * d), offset)
     result.status = STEP_LIMIT
     return result

@@ -32,6 +32,7 @@ from warp_reflect.layers import (
     GBuffer,
     MirrorPixels,
     ReflectionLayer,
+    add_statistics,
     eye_ray_direction,
     pixel_bounds,
 )
@@ -605,11 +606,11 @@ def behind(
             total = wp.zeros(count, dtype=wp.vec3, device=device)
         launch.launch(gather_kernel, n, [numbers, own, faded, seen, total], device, threads)
         if depth == settings.transparency_depth:
-            _count(first, depth_limit=len(going))
+            add_statistics(first.statistics, {"depth_limit": len(going)})
             break
         if not len(going):
             break
-        _count(first, onward=len(going))
+        add_statistics(first.statistics, {"onward": len(going)})
         taken = lambda array: wp.array(array.numpy()[going], dtype=array.dtype, device=device)  # noqa: B023, E731
         index, weight = index[going], taken(carried)
         fading = taken(still_fading) if len(fading) else fading
@@ -634,11 +635,6 @@ def behind(
 def _meets_transparent(scene: Scene, interfaces: Interfaces, layer: ReflectionLayer) -> bool:
     triangle = layer.triangle.numpy()
     return bool(interfaces.clear[scene.host_triangle_patch[triangle[triangle >= 0]]].any())
-
-
-def _count(layer: ReflectionLayer, **numbers: int) -> None:
-    for name, value in numbers.items():
-        layer.statistics[name] = layer.statistics.get(name, 0) + value
 
 
 def add_to_picture(picture: wp.array, transmission: Transmission, radiance: wp.array, threads: int = 0) -> None:
