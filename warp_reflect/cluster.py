@@ -60,25 +60,33 @@ def render_on_cluster(
     with contextlib.ExitStack() as stack:
         report.busy("starting workers")
         client = stack.enter_context(_client(distributed, job, workers, scheduler))
-        if scheduler is not None:
-            workers = max(len(client.scheduler_info(n_workers=-1)["workers"]), 1)
+        addresses = sorted(client.scheduler_info(n_workers=-1)["workers"])
+        workers = len(addresses) or workers
         stop = distributed.Event(run, client=client)
         events: queue.SimpleQueue = queue.SimpleQueue()
         client.subscribe_topic(run, lambda event: events.put(event[1]["outcome"]))
         stack.callback(client.unsubscribe_topic, run)
 
-        def submit(batch: list[int]) -> None:
+        def submit(batch: list[int], address: str | None = None) -> None:
             part, local = job.cut(batch)
             future = client.submit(
-                render_batch, part, local, batch, digest, resume, deadline, run, pure=False, priority=-batch[0]
+                render_batch,
+                *(part, local, batch, digest, resume, deadline, run),
+                pure=False,
+                priority=-batch[0],
+                workers=address,
+                allow_other_workers=address is not None,
             )
             waiting[future] = batch
 
         size = min(BATCH_MAX, -(-len(places) // (BATCHES_PER_WORKER * workers)))
         waiting: dict = {}
         told: set[int] = set()
-        for batch in _batches(job, places, size):
-            submit(batch)
+        batches = _batches(job, places, size)
+        for k, batch in enumerate(batches):
+            # Each worker is to have one part of the range: what a batch's first frame takes from the one before is at
+            # hand. One that has nothing left may take from another, so may any where one is lost.
+            submit(batch, addresses[k * workers // len(batches)] if addresses else None)
         while waiting:
             with contextlib.suppress(queue.Empty):
                 outcome = _from_plain(events.get(timeout=POLL_SECONDS))
