@@ -25,7 +25,7 @@ FLOORS = {
     "images metrics timing clipping cutouts",
     2: "scene reflectors environment_maps baked_maps segments layers bvh raster raster_vector shade shade_vector surface "
     "surface_vector pictures textures holes cut_shadows "
-    "normal_maps bounces direct shadows transmission waves channels stage stage.* scene_field "
+    "normal_maps bounces direct shadows transmission transmission_vector waves waves_vector channels stage stage.* scene_field "
     "baked_environments",
     3: "solve solver solve_device solve_plane solve_convex solve_map solve_general solve_qim solver_gradients mirrors "
     "refraction solve_refraction solver_arrays reflector_maps techniques techniques.* finishes finishes.*",

@@ -13,7 +13,7 @@ from panes import HALF, SIZE, WATER, balls, eye_rays, floor_error_px, frame, sho
 from rooms import CHROME, placed, sphere, square
 
 import warp_reflect as wr
-from warp_reflect import raster, waves
+from warp_reflect import raster, surface, waves
 from warp_reflect.images import write_exr
 from warp_reflect.scene import MaterialData, Scene, TextureRef
 
@@ -176,7 +176,8 @@ def test_normals_have_the_slope_asked_for_and_do_not_care_where_the_stage_is():
         gbuffer = raster.draw_scene(scene, view)
         none = waves.wp.zeros(0, dtype=waves.wp.vec3, device=scene.device)
         finish = {0: scene.data.materials[scene.parts[0].material].finish}
-        n = waves.wave_normals(scene, gbuffer, none, finish).numpy().astype(float)
+        seen = surface.part_pixels(scene, gbuffer, finish, {})
+        n = waves.wave_normals(scene, gbuffer, none, finish, seen).numpy().astype(float)
         slopes.append((n[:, [0, 2]] / n[:, 1:2]).reshape(90, 160, 2))
     rms = [np.sqrt((each**2).sum(axis=2).mean()) for each in slopes]
     np.testing.assert_allclose(rms, 0.05, rtol=0.15)

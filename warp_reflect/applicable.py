@@ -53,7 +53,7 @@ def work_of(
     passes, held = module.extent(scene, reflector) if sheets else (1, 1.0)
     parallax = 0.0
     if technique == "environment":
-        parallax = module.parallax_px(scene, reflector, camera, settings.threads)
+        parallax = module.parallax_px(scene, reflector, camera, settings.threads, settings.kernels)
     return Work(
         pixels,
         scene.vertex_count - (part.vertex_count if part.is_whole else 0),

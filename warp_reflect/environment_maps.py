@@ -373,6 +373,7 @@ def render_maps(
     levels: bool = False,
     shadows: Shadows | None = None,
     threads: int = 0,
+    kernels: str = "auto",
 ) -> CubeMaps:
     """Draw the cube maps of a scene at many places in one go.
 
@@ -386,6 +387,7 @@ def render_maps(
         levels: Coarser levels for blurred look-ups, a third more memory.
         shadows: Which lights cast shadows; None: none.
         threads: CPU threads; 0: one per core.
+        kernels: `Settings.kernels`.
 
     Raises:
         ValueError: a resolution or centres that cannot be.
@@ -400,7 +402,8 @@ def render_maps(
     for k, centre in enumerate(centres):
         for face in range(FACE_COUNT):
             camera = face_camera(scene, centre, axes[k], face, resolution)
-            _draw_face(scene, camera, maps, k, face, without[k] if without else (), onward, shadows, threads)
+            gone = without[k] if without else ()
+            _draw_face(scene, camera, maps, k, face, gone, onward, shadows, threads, kernels)
     for level in range(1, maps.view.level_count):
         n = int(maps.view.level_size.numpy()[level])
         count = maps.count * FACE_COUNT * n * n
@@ -522,12 +525,12 @@ def face_camera(scene: Scene, centre: np.ndarray, axes: np.ndarray, face: int, r
     return Camera(centre, right, up, forward, half, half, half, half, near, far, (resolution, resolution))
 
 
-def _draw_face(scene, camera, maps, k, face, without, onward, shadows, threads) -> None:
+def _draw_face(scene, camera, maps, k, face, without, onward, shadows, threads, kernels) -> None:
     """Draw, shade and store one face."""
     device, count = scene.device, camera.size[0] * camera.size[1]
-    gbuffer = raster.draw_scene(scene, camera, threads, without)
+    gbuffer = raster.draw_scene(scene, camera, threads, without, kernels)
     layer, distance = texel_hits(scene, gbuffer, threads)
-    radiance = shade.seen_radiance(scene, gbuffer, layer, threads, shadows)
+    radiance = shade.seen_radiance(scene, gbuffer, layer, threads, shadows, kernels)
     if onward is not None:
         onward(gbuffer, layer, radiance)
     view = maps.view

@@ -28,7 +28,7 @@ from warp_reflect.effects import FINISHES, PANE_FINISHES, finish_of, moves_with_
 from warp_reflect.layers import NO_REFLECTOR, Camera, GBuffer, MirrorPixels, ReflectionLayer, add_statistics
 from warp_reflect.planner import PaneRow, Plan, PlanRow, find_camera, keep_pace
 from warp_reflect.scene import Scene
-from warp_reflect.settings import Technique
+from warp_reflect.settings import Settings, Technique
 from warp_reflect.techniques import MAPS, TECHNIQUES
 from warp_reflect.timing import StageTimer
 from warp_reflect.virtual_objects import virtual_objects
@@ -263,7 +263,8 @@ def render_frame(scene: Scene, plan: Plan, camera: str | Camera | None = None, p
     else:
         interfaces = _interfaces(scene, plan)
         with timer("shade"):
-            shown, met = _shown(scene, plan, gbuffer, interfaces, layers)
+            surfaces = _surfaces(scene, plan, gbuffer, layers)
+            shown, met = _shown(scene, plan, gbuffer, interfaces, layers, surfaces)
             finish = _finish(scene, plan)
             picture = shade.shade(
                 scene, gbuffer, layers, settings.threads, plan.shadows, finish, shown, settings.kernels
@@ -271,7 +272,8 @@ def render_frame(scene: Scene, plan: Plan, camera: str | Camera | None = None, p
         transmitted = {}
         if interfaces is not None:
             with timer("transmission"):
-                transmitted = _look_through(scene, plan, transmission.Through(shown, interfaces, met), picture)
+                through = transmission.Through(shown, interfaces, met)
+                transmitted = _look_through(scene, plan, through, surfaces, picture)
     timings = timer.ms
     for id in layers.keys() - kept:
         for step, ms in layers[id].timings.items():
@@ -329,22 +331,31 @@ def _interfaces(scene: Scene, plan: Plan) -> transmission.Interfaces | None:
     return transmission.make_interfaces(scene, finishes)
 
 
+def _surfaces(
+    scene: Scene, plan: Plan, gbuffer: GBuffer, layers: dict[int, ReflectionLayer]
+) -> dict[int, MirrorPixels]:
+    """By part: the pixels of what has waves or is looked through."""
+    parts = dict.fromkeys([*_wavy(plan), *(pane.part for pane in plan.panes)])
+    known = {row.reflector.part: layers[row.reflector.id].pixels for row in plan.rows if row.reflector.id in layers}
+    return surface.part_pixels(scene, gbuffer, parts, known, plan.settings.threads, plan.settings.kernels)
+
+
 def _shown(
     scene: Scene,
     plan: Plan,
     gbuffer: GBuffer,
     interfaces: transmission.Interfaces | None,
     layers: dict[int, ReflectionLayer],
+    surfaces: dict[int, MirrorPixels],
 ) -> tuple[shade.Shown, transmission.Met]:
     """What the eye sees, with the waves on it; how rays see mirrors and, in the former alone, through surfaces."""
-    threads = plan.settings.threads
+    threads, kernels = plan.settings.threads, plan.settings.kernels
     bumpy = [row.reflector.id for row in plan.rows if row.effects["normal_map"].on]
-    shown = shade.look(scene, gbuffer, threads, plan.shadows, bumpy, plan.settings.kernels)
-    surfaces = [*((row.reflector.part, row) for row in plan.rows), *((pane.part, pane) for pane in plan.panes)]
-    wavy = {part: row.settings for part, row in surfaces if _has_waves(row)}
+    shown = shade.look(scene, gbuffer, threads, plan.shadows, bumpy, kernels)
+    wavy = _wavy(plan)
     if wavy:
         asked = {k: finish_of(scene.data.materials[scene.parts[k].material], each) for k, each in wavy.items()}
-        normals = waves.wave_normals(scene, gbuffer, shown.normals, asked, threads)
+        normals = waves.wave_normals(scene, gbuffer, shown.normals, asked, surfaces, threads, kernels)
         shown = dataclasses.replace(shown, normals=normals)
     met = _met(scene, plan, shown, interfaces, layers)
     if interfaces is None:
@@ -395,6 +406,12 @@ def _met(
     return met
 
 
+def _wavy(plan: Plan) -> dict[int, Settings]:
+    """The parts that have waves, and their settings."""
+    surfaces = [*((row.reflector.part, row) for row in plan.rows), *((pane.part, pane) for pane in plan.panes)]
+    return {part: row.settings for part, row in surfaces if _has_waves(row)}
+
+
 def _has_waves(row: PlanRow | PaneRow) -> bool:
     """Not where it is a normal map alone that bends what is seen through a surface."""
     effect = row.effects["waves"]
@@ -402,11 +419,10 @@ def _has_waves(row: PlanRow | PaneRow) -> bool:
 
 
 def _look_through(
-    scene: Scene, plan: Plan, through: transmission.Through, picture: tuple
+    scene: Scene, plan: Plan, through: transmission.Through, pixels: dict[int, MirrorPixels], picture: tuple
 ) -> dict[int, transmission.Transmission]:
     """Add to a picture what the eye sees through transparent surfaces; it, by the surfaces' parts."""
     settings, shown, interfaces = plan.settings, through.shown, through.interfaces
-    pixels = surface.seen_parts(scene, shown.gbuffer, [pane.part for pane in plan.panes])
     transmitted = {}
     for pane in plan.panes:
         if pane.part not in pixels:

@@ -518,11 +518,13 @@ def _look(
     casting = needs_probe(scene, settings)
     if not scene.triangle_count or not (mirrors or panes or casting):
         return dict.fromkeys([*mirrors, *panes], 0), None
-    small = preview(scene, camera, settings.threads)
+    small = preview(scene, camera, settings.threads, settings.kernels)
     pixels = small.pixels_of(scene, [*mirrors, *panes])
     seen = [k for k in mirrors if pixels[k] >= max(settings.few_pixels, 1)]
     facing = settings.bounces > 1 and (len(mirrors) > 1 or any(not scene.body(k).convex for k in seen))
-    return pixels, probe(scene, small, mirrors, settings.threads) if casting or facing else None
+    if not (casting or facing):
+        return pixels, None
+    return pixels, probe(scene, small, mirrors, settings.threads, settings.kernels)
 
 
 def _row(scene, camera, settings, method, number, part_index, part, weight, pixels, notes, costs) -> PlanRow:

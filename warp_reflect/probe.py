@@ -52,8 +52,8 @@ class Probe:
     mirrored: dict[int, dict[int, float]]
 
 
-def preview(scene: Scene, camera: Camera, threads: int = 0) -> Preview:
-    """Draw a scene small."""
+def preview(scene: Scene, camera: Camera, threads: int = 0, kernels: str = "auto") -> Preview:
+    """Draw a scene small; `kernels` as in `Settings`."""
     width, height = camera.size
     shrink = max(1.0, max(width, height) / PREVIEW_SIDE)
     small = dataclasses.replace(
@@ -64,11 +64,11 @@ def preview(scene: Scene, camera: Camera, threads: int = 0) -> Preview:
         cx=camera.cx / shrink,
         cy=camera.cy / shrink,
     )
-    gbuffer = raster.draw_scene(scene, small, threads)
+    gbuffer = raster.draw_scene(scene, small, threads, kernels=kernels)
     return Preview(gbuffer, width * height / (small.size[0] * small.size[1]))
 
 
-def probe(scene: Scene, small: Preview, parts: list[int], threads: int = 0) -> Probe:
+def probe(scene: Scene, small: Preview, parts: list[int], threads: int = 0, kernels: str = "auto") -> Probe:
     """Try every `STRIDE`-th point of a preview in both directions, and what mirrors show there.
 
     Args:
@@ -76,6 +76,7 @@ def probe(scene: Scene, small: Preview, parts: list[int], threads: int = 0) -> P
         small: Of the scene.
         parts: The reflectors, indices into `scene.parts`.
         threads: CPU threads.
+        kernels: `Settings.kernels`.
     """
     gbuffer = small.gbuffer
     width, height = gbuffer.camera.size
@@ -86,7 +87,7 @@ def probe(scene: Scene, small: Preview, parts: list[int], threads: int = 0) -> P
     count = float(np.count_nonzero(triangle >= 0))
     ids = dict(enumerate(parts, 1))
     mirrored: dict[int, dict[int, float]] = {}
-    pixels, _ = surface.mirror_pixels(scene, gbuffer, ids, threads)
+    pixels, _ = surface.mirror_pixels(scene, gbuffer, ids, threads, kernels)
     mirror_of_patch = np.full(max(len(scene.patch_shapes), 1), -1)
     for part in parts:
         mirror_of_patch[list(scene.parts[part].patches)] = part

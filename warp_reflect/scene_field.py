@@ -238,7 +238,7 @@ def build_heightfield(scene, low, high, axes, settings, without) -> tuple[Height
     camera = Camera(
         eye + scene.origin, right, up, forward, 1.0 / cell, 1.0 / cell, 0.5 * nx, 0.5 * ny, 0.0, depth, (nx, ny), True
     )
-    seen = raster.draw_scene(scene, camera, settings.threads, without)
+    seen = raster.draw_scene(scene, camera, settings.threads, without, settings.kernels)
     own = seen.triangle.numpy()
     heights = high[2] + cell - corner[2] - (1.0 - seen.depth_key.numpy().astype(np.float64)) * depth
     heights[own < 0] = np.nan

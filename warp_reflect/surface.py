@@ -12,7 +12,15 @@ import numpy as np
 import warp as wp
 
 from warp_reflect import launch, vector
-from warp_reflect.layers import CameraView, GBuffer, MirrorPixels, eye_ray_direction, eye_ray_origin, pixel_bounds
+from warp_reflect.layers import (
+    NO_REFLECTOR,
+    CameraView,
+    GBuffer,
+    MirrorPixels,
+    eye_ray_direction,
+    eye_ray_origin,
+    pixel_bounds,
+)
 from warp_reflect.scene import SHAPE_PLANE, SHAPE_QUADRIC, Scene, SceneView
 from warp_reflect.shapes import clamp_weights, facet_normal, intersect_triangle, max_abs, unit
 
@@ -317,27 +325,60 @@ def mirror_pixels(
     found = _pixels_by_reflector(reflector_id.numpy(), parts)
     result = {}
     for reflector in parts:
-        pixel = found[reflector]
-        n = len(pixel)
-        mirror = MirrorPixels(
-            reflector=reflector,
-            pixel=wp.array(pixel, dtype=int, device=device),
-            point=wp.empty(n, dtype=wp.vec3, device=device),
-            normal=wp.empty(n, dtype=wp.vec3, device=device),
-            direction=wp.empty(n, dtype=wp.vec3, device=device),
-            box=pixel_bounds(pixel, width),
-        )
-        seen = [gbuffer.view, gbuffer.triangle, gbuffer.depth_key, mirror.pixel]
-        outputs = [mirror.point, mirror.normal, mirror.direction]
-        if vector.chosen(kernels, device):
-            from warp_reflect import surface_vector  # which reflects at this module's surface
-
-            inputs = [scene.view, scene.triangle_records, *seen, *outputs]
-            vector.launch_blocks(surface_vector.mirror_blocks_kernel, n, inputs, device, threads)
-        else:
-            launch.launch(mirror_pixels_kernel, n, [scene.view, *seen, *outputs], device, threads)
-        result[reflector] = mirror
+        result[reflector] = _met(scene, gbuffer, reflector, found[reflector], threads, kernels)
     return result, reflector_id
+
+
+def _met(scene: Scene, gbuffer: GBuffer, reflector: int, pixel: np.ndarray, threads: int, kernels: str) -> MirrorPixels:
+    """The surface at some pixels of the picture."""
+    n, device = len(pixel), scene.device
+    mirror = MirrorPixels(
+        reflector=reflector,
+        pixel=wp.array(pixel, dtype=int, device=device),
+        point=wp.empty(n, dtype=wp.vec3, device=device),
+        normal=wp.empty(n, dtype=wp.vec3, device=device),
+        direction=wp.empty(n, dtype=wp.vec3, device=device),
+        box=pixel_bounds(pixel, gbuffer.camera.size[0]),
+    )
+    seen = [gbuffer.view, gbuffer.triangle, gbuffer.depth_key, mirror.pixel]
+    outputs = [mirror.point, mirror.normal, mirror.direction]
+    if vector.chosen(kernels, device):
+        from warp_reflect import surface_vector  # which reflects at this module's surface
+
+        inputs = [scene.view, scene.triangle_records, *seen, *outputs]
+        vector.launch_blocks(surface_vector.mirror_blocks_kernel, n, inputs, device, threads)
+    else:
+        launch.launch(mirror_pixels_kernel, n, [scene.view, *seen, *outputs], device, threads)
+    return mirror
+
+
+def part_pixels(
+    scene: Scene,
+    gbuffer: GBuffer,
+    parts: Iterable[int],
+    known: Mapping[int, MirrorPixels],
+    threads: int = 0,
+    kernels: str = "auto",
+) -> dict[int, MirrorPixels]:
+    """The pixels at which the eye sees each of some parts, mirrors or not, with the surface there.
+
+    Args:
+        scene: On the G-buffer's device.
+        gbuffer: What the eye sees.
+        parts: Indices into `scene.parts`.
+        known: Those of mirrors, by part, as `mirror_pixels` found them: they are taken as they are.
+        threads: CPU threads; 0: one per core.
+        kernels: `Settings.kernels`.
+
+    Returns:
+        Part to its pixels, of the reflector `NO_REFLECTOR` where it is none; nothing of a part that is not seen.
+    """
+    found = {part: known[part] for part in parts if part in known}
+    others = [part for part in parts if part not in known]
+    if others:
+        for part, pixel in seen_parts(scene, gbuffer, others).items():
+            found[part] = _met(scene, gbuffer, NO_REFLECTOR, pixel, threads, kernels)
+    return {part: pixels for part, pixels in found.items() if pixels.count}
 
 
 def seen_parts(scene: Scene, gbuffer: GBuffer, parts: Iterable[int]) -> dict[int, np.ndarray]:

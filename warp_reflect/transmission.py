@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from warp_reflect import bvh, launch, shade
+from warp_reflect import bvh, launch, shade, vector
 from warp_reflect.layers import (
     NO_REFLECTOR,
     CameraView,
@@ -34,14 +34,13 @@ from warp_reflect.layers import (
     ReflectionLayer,
     add_statistics,
     eye_ray_direction,
-    pixel_bounds,
 )
 from warp_reflect.normal_maps import prepare_normals
 from warp_reflect.optics import PI, dielectric_reflectance, refract, tangent_basis
 from warp_reflect.scene import SHAPE_NONE, FinishData, PartRange, Scene, SceneView
 from warp_reflect.settings import Settings, Technique
 from warp_reflect.shapes import facet_normal, unit
-from warp_reflect.surface import hit_normal, polish, shown_normal, surface_at
+from warp_reflect.surface import hit_normal, polish, shown_normal
 from warp_reflect.textures import Look, plain_look, prepare_looks
 
 wp.set_module_options({"enable_backward": False})
@@ -100,13 +99,17 @@ class Transmission:
     """What is seen through one surface.
 
     Attributes:
+        surface: The pixels that show it.
         layer: Its pixels' rays behind the surface and the first thing that they meet.
         weight: vec3 [n], share of it in the picture.
+        inside: uint8 [n], 1 where the ray has gone into the surface's body.
         nearness: float [n], mean of 1 / length of the way to what is seen in the end, 0 for the sky; set by `behind`.
     """
 
+    surface: MirrorPixels
     layer: ReflectionLayer
     weight: wp.array
+    inside: wp.array
     nearness: wp.array
 
 
@@ -254,38 +257,34 @@ def cross_interface(
     return crossing
 
 
-@wp.kernel
-def cross_seen_kernel(
-    first: int,
+@wp.func
+def cross_pixel(
     scene: SceneView,
     camera: CameraView,
     interfaces: wp.array(dtype=InterfaceView),
     looks: wp.array(dtype=Look),
     normals: wp.array(dtype=wp.vec3),
     triangle: wp.array(dtype=int),
-    depth_key: wp.array(dtype=float),
     reflector_id: wp.array(dtype=int),
-    pixel: wp.array(dtype=int),
-    # Which ray of how many of a frosted surface's cone (of 0: its middle); whether normal maps and waves bend rays that enter:
+    p: int,
+    normal: wp.vec3,
+    direction: wp.vec3,
     sample: int,
     count: int,
     wavy: int,
-    # Outputs:
+    i: int,
     out_facet: wp.array(dtype=int),
-    out_point: wp.array(dtype=wp.vec3),
     out_normal: wp.array(dtype=wp.vec3),
     out_direction: wp.array(dtype=wp.vec3),
     out_inside: wp.array(dtype=wp.uint8),
     out_weight: wp.array(dtype=wp.vec3),
 ):
-    """One thread per pixel that shows a transparent surface."""
-    i = first + wp.tid()
-    p = pixel[i]
+    """The ray behind pixel p of the picture, whose surface reflects along `direction` at `normal`, into entry i."""
     row = p // camera.width
     tri = triangle[p]
     x = float(p - row * camera.width) + 0.5
     y = float(row) + 0.5
-    s = surface_at(scene, camera, tri, depth_key[p], x, y)
+    incident = unit(direction - 2.0 * wp.dot(direction, normal) * normal)
     uv = shade.weights_seen(scene, camera, tri, x, y)
     look = Look()
     if looks.shape[0] > 0:
@@ -298,18 +297,67 @@ def cross_seen_kernel(
     if count > 0:
         disc = disc_sample(p, sample, count)
     interface = interfaces[scene.triangle_patch[tri]]
-    bent = s.normal
+    bent = normal
     corner = scene.triangles[tri]
     outward = facet_normal(scene.points[corner[0]], scene.points[corner[1]], scene.points[corner[2]])
-    if wavy != 0 or wp.dot(outward, s.incident) > 0.0:
-        bent = shown_normal(normals, p, s.normal)
-    crossing = cross_interface(scene, interface, look, tri, bent, s.incident, shaded, reflector_id[p] > 0, disc)
+    if wavy != 0 or wp.dot(outward, incident) > 0.0:
+        bent = shown_normal(normals, p, normal)
+    crossing = cross_interface(scene, interface, look, tri, bent, incident, shaded, reflector_id[p] > 0, disc)
     out_facet[i] = tri
-    out_point[i] = s.p_scene
     out_normal[i] = crossing.normal
     out_direction[i] = crossing.direction
     out_inside[i] = wp.uint8(crossing.inside)
     out_weight[i] = crossing.weight
+
+
+@wp.kernel
+def cross_seen_kernel(
+    first: int,
+    scene: SceneView,
+    camera: CameraView,
+    interfaces: wp.array(dtype=InterfaceView),
+    looks: wp.array(dtype=Look),
+    normals: wp.array(dtype=wp.vec3),
+    triangle: wp.array(dtype=int),
+    reflector_id: wp.array(dtype=int),
+    # Pixels of the surface:
+    pixel: wp.array(dtype=int),
+    normal: wp.array(dtype=wp.vec3),
+    direction: wp.array(dtype=wp.vec3),
+    # Which ray of how many of a frosted surface's cone (of 0: its middle); whether normal maps and waves bend rays that enter:
+    sample: int,
+    count: int,
+    wavy: int,
+    # Outputs:
+    out_facet: wp.array(dtype=int),
+    out_normal: wp.array(dtype=wp.vec3),
+    out_direction: wp.array(dtype=wp.vec3),
+    out_inside: wp.array(dtype=wp.uint8),
+    out_weight: wp.array(dtype=wp.vec3),
+):
+    """One thread per pixel that shows a transparent surface."""
+    i = first + wp.tid()
+    cross_pixel(
+        scene,
+        camera,
+        interfaces,
+        looks,
+        normals,
+        triangle,
+        reflector_id,
+        pixel[i],
+        normal[i],
+        direction[i],
+        sample,
+        count,
+        wavy,
+        i,
+        out_facet,
+        out_normal,
+        out_direction,
+        out_inside,
+        out_weight,
+    )
 
 
 @wp.func
@@ -492,7 +540,7 @@ def look_through(
     scene: Scene,
     shown: shade.Shown,
     interfaces: Interfaces,
-    pixel: np.ndarray,
+    surface: MirrorPixels,
     settings: Settings,
     sample: tuple[int, int] = (0, 0),
     wavy: bool = False,
@@ -503,24 +551,28 @@ def look_through(
         scene: On the G-buffer's device.
         shown: What the eye sees.
         interfaces: From `make_interfaces`.
-        pixel: Of one surface, from `surface.seen_parts`.
-        settings: Threads.
+        surface: The pixels of one surface, from `surface.part_pixels`.
+        settings: Threads, kernels.
         sample: (k, n): ray k of n of the cone into which a frosted surface scatters; (0, 0): its middle.
         wavy: Rays are bent at the normals of `shown`, waves included; otherwise only those that leave a body are.
     """
-    device, threads, gbuffer = scene.device, settings.threads, shown.gbuffer
-    n = len(pixel)
-    vectors = [wp.empty(n, dtype=wp.vec3, device=device) for _ in range(4)]
-    point, normal, direction, weight = vectors
+    device, threads, gbuffer, n = scene.device, settings.threads, shown.gbuffer, surface.count
+    normal, direction, weight = (wp.empty(n, dtype=wp.vec3, device=device) for _ in range(3))
     facet, inside = wp.empty(n, dtype=int, device=device), wp.empty(n, dtype=wp.uint8, device=device)
-    box = pixel_bounds(pixel, gbuffer.camera.size[0])
-    pixels = MirrorPixels(NO_REFLECTOR, wp.array(pixel, dtype=int, device=device), point, normal, direction, box)
-    inputs = [scene.view, gbuffer.view, interfaces.views, shown.looks, shown.normals, gbuffer.triangle]
-    inputs += [gbuffer.depth_key, gbuffer.reflector_id, pixels.pixel, *sample, int(wavy)]
-    launch.launch(cross_seen_kernel, n, [*inputs, facet, *vectors[:3], inside, weight], device, threads)
+    inputs = [gbuffer.view, interfaces.views, shown.looks, shown.normals, gbuffer.triangle, gbuffer.reflector_id]
+    inputs += [surface.pixel, surface.normal, surface.direction, *sample, int(wavy)]
+    outputs = [facet, normal, direction, inside, weight]
+    if vector.chosen(settings.kernels, device):
+        from warp_reflect import transmission_vector  # which works with this module's structures
+
+        inputs = [scene.view, scene.triangle_records, *inputs, *outputs]
+        vector.launch_blocks(transmission_vector.cross_blocks_kernel, n, inputs, device, threads)
+    else:
+        launch.launch(cross_seen_kernel, n, [scene.view, *inputs, *outputs], device, threads)
+    pixels = MirrorPixels(NO_REFLECTOR, surface.pixel, surface.point, normal, direction, surface.box)
     layer = ReflectionLayer.empty(pixels, Technique.RAYTRACED, device)
     bvh.trace_transmitted(scene, layer, facet, inside, threads)
-    return Transmission(layer, weight, wp.zeros(n, dtype=float, device=device))
+    return Transmission(surface, layer, weight, inside, wp.zeros(n, dtype=float, device=device))
 
 
 def through_radiance(scene: Scene, through: Through, found: Transmission, settings: Settings) -> wp.array:

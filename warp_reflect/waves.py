@@ -15,11 +15,11 @@ from collections.abc import Mapping
 import numpy as np
 import warp as wp
 
-from warp_reflect import launch
-from warp_reflect.layers import CameraView, GBuffer, eye_ray_direction, eye_ray_origin
+from warp_reflect import launch, vector
+from warp_reflect.layers import CameraView, GBuffer, MirrorPixels, eye_ray_direction
 from warp_reflect.scene import FinishData, PartRange, Scene, SceneView
 from warp_reflect.shapes import facet_normal, unit
-from warp_reflect.surface import seen_parts, shown_normal
+from warp_reflect.surface import shown_normal
 
 wp.set_module_options({"enable_backward": False})
 
@@ -109,43 +109,37 @@ def wave_normals_kernel(
     scene: SceneView,
     camera: CameraView,
     waves: wp.array(dtype=Wave),
-    patch_waves: wp.array(dtype=int),
-    count: int,
     triangle: wp.array(dtype=int),
+    # Pixels that show the waves:
     pixel: wp.array(dtype=int),
+    point: wp.array(dtype=wp.vec3),
+    normal: wp.array(dtype=wp.vec3),
     out_normals: wp.array(dtype=wp.vec3),
 ):
-    """One thread per pixel that shows waves; finds what is not wavy in `out_normals`."""
-    i = pixel[first + wp.tid()]
-    tri = triangle[i]
-    start = patch_waves[scene.triangle_patch[tri]]
+    """One thread per pixel; finds what normal maps give in `out_normals`."""
+    k = first + wp.tid()
+    i = pixel[k]
+    corner = scene.triangles[triangle[i]]
+    outward = facet_normal(scene.points[corner[0]], scene.points[corner[1]], scene.points[corner[2]])
     row = i // camera.width
-    x = float(i - row * camera.width) + 0.5
-    y = float(row) + 0.5
-    corner = scene.triangles[tri]
-    a = scene.points[corner[0]]
-    outward = facet_normal(a, scene.points[corner[1]], scene.points[corner[2]])
-    d = eye_ray_direction(camera, x, y)
-    from_eye = a - camera.eye - eye_ray_origin(camera, x, y)
+    d = eye_ray_direction(camera, float(i - row * camera.width) + 0.5, float(row) + 0.5)
     facing = wp.dot(outward, d)
     if facing == 0.0:
         return
-    depth = wp.dot(outward, from_eye) / facing
-    p = camera.eye + eye_ray_origin(camera, x, y) + depth * d
-    n = outward
-    if facing > 0.0:
-        n = -outward
+    p = point[k]
+    n = normal[k]
     # How the point moves over the surface from pixel to pixel.
     step_x = camera.ray_dx
     step_y = camera.ray_dy
     if camera.orthographic == 0:
+        depth = wp.dot(camera.forward, p - camera.eye)
         step_x = depth * step_x
         step_y = depth * step_y
     step_x -= (wp.dot(outward, step_x) / facing) * d
     step_y -= (wp.dot(outward, step_y) / facing) * d
     tilt = wp.vec3(0.0, 0.0, 0.0)
-    for j in range(count):
-        wave = waves[start + j]
+    for j in range(waves.shape[0]):
+        wave = waves[j]
         along_x = wp.dot(wave.way, step_x)
         along_y = wp.dot(wave.way, step_y)
         unseen = BOX_EXPONENT * wave.turns * wave.turns * (along_x * along_x + along_y * along_y)
@@ -157,41 +151,55 @@ def wave_normals_kernel(
     # The waves' own normal is that of the triangle's winding; from the other side crests are troughs.
     if facing > 0.0:
         tilt = -tilt
+    # Slopes add up: a normal map's normal counts by what it has across for a unit along the surface's.
+    mapped = shown_normal(out_normals, i, n)
+    rise = wp.max(wp.dot(mapped, n), LEAST_FACING)
+    turned = unit(mapped / rise - tilt)
     incident = unit(d)
-    n = unit(shown_normal(out_normals, i, n) - tilt)
-    toward = -wp.dot(n, incident)
+    toward = -wp.dot(turned, incident)
     if toward < LEAST_FACING:
-        n = unit(n + (toward - LEAST_FACING) * incident)
-    out_normals[i] = n
+        turned = unit(turned + (toward - LEAST_FACING) * incident)
+    out_normals[i] = turned
 
 
 def wave_normals(
-    scene: Scene, gbuffer: GBuffer, normals: wp.array, finishes: Mapping[int, FinishData], threads: int = 0
+    scene: Scene,
+    gbuffer: GBuffer,
+    normals: wp.array,
+    finishes: Mapping[int, FinishData],
+    pixels: Mapping[int, MirrorPixels],
+    threads: int = 0,
+    kernels: str = "auto",
 ) -> wp.array:
     """Normals of what the eye sees with the waves of some parts.
 
     Args:
         scene: On the G-buffer's device; its time is the waves'.
         gbuffer: What the eye sees.
-        normals: Those that normal maps give, see `normal_maps.prepare_normals`; waves come on top of them.
+        normals: Those that normal maps give, see `normal_maps.prepare_normals`; the slopes of the waves are added to theirs.
         finishes: Part to what is asked of it.
+        pixels: At which the eye sees them, from `surface.part_pixels`; a part that it does not see may be missing.
         threads: CPU threads; 0: one per core.
+        kernels: `Settings.kernels`.
 
     Returns:
-        vec3 [pixels], unit towards the eye, 0 where the surface's own normal counts.
+        vec3 [pixels of the G-buffer], unit towards the eye, 0 where the surface's own normal counts.
     """
     device = scene.device
-    waves: list[Wave] = []
-    patch_waves = np.full(max(len(scene.patch_shapes), 1), -1, np.int32)
-    for index, finish in finishes.items():
-        patch_waves[list(scene.parts[index].patches)] = len(waves)
-        waves += waves_of(scene, scene.parts[index], finish)
-    pixel = seen_parts(scene, gbuffer, finishes)
-    if not pixel:
+    asked = {part: finish for part, finish in finishes.items() if part in pixels}
+    if not asked:
         return normals
     bent = wp.clone(normals) if len(normals) else wp.zeros(len(gbuffer.triangle), dtype=wp.vec3, device=device)
-    pixels = wp.array(np.concatenate(list(pixel.values())), dtype=int, device=device)
-    inputs = [scene.view, gbuffer.view, wp.array(waves, dtype=Wave, device=device)]
-    inputs += [wp.array(patch_waves, dtype=int, device=device), WAVE_COUNT, gbuffer.triangle, pixels]
-    launch.launch(wave_normals_kernel, len(pixels), [*inputs, bent], device, threads)
+    for part, finish in asked.items():
+        seen = pixels[part]
+        waves = wp.array(waves_of(scene, scene.parts[part], finish), dtype=Wave, device=device)
+        inputs = [gbuffer.view, waves, gbuffer.triangle, seen.pixel, seen.point, seen.normal, bent]
+        if vector.chosen(kernels, device):
+            from warp_reflect import waves_vector  # which works with this module's structure
+
+            limits = [LEAST_FACING, LEAST_SEEN, MOST_SEEN, BOX_EXPONENT, SINE_1, SINE_3, SINE_5]
+            inputs = [scene.triangle_records, *limits, *inputs]
+            vector.launch_blocks(waves_vector.wave_blocks_kernel, seen.count, inputs, device, threads)
+        else:
+            launch.launch(wave_normals_kernel, seen.count, [scene.view, *inputs], device, threads)
     return bent

@@ -144,12 +144,12 @@ def apply_through(scene: Scene, through: Through, found: Transmission, radiance:
 
 def accumulated(scene: Scene, through: Through, found: Transmission, pane, samples: int) -> wp.array:
     """The mean over `samples` rays a pixel."""
-    pixel = found.layer.pixels.pixel.numpy()
-    total = wp.zeros(len(pixel), dtype=wp.vec3, device=scene.device)
+    n = found.surface.count
+    total = wp.zeros(n, dtype=wp.vec3, device=scene.device)
     for k in range(samples):
-        ray = look_through(scene, through.shown, through.interfaces, pixel, pane.settings, (k, samples))
+        ray = look_through(scene, through.shown, through.interfaces, found.surface, pane.settings, (k, samples))
         seen = through_radiance(scene, through, ray, pane.settings)
-        launch.launch(mean_kernel, len(pixel), [samples, seen, total], scene.device, pane.settings.threads)
+        launch.launch(mean_kernel, n, [samples, seen, total], scene.device, pane.settings.threads)
     return total
 
 

@@ -17,13 +17,11 @@ class Pyramid:
 
     Attributes:
         color: Radiance and coverage, multiplied by the latter; picture by picture, level by level.
-        nearness: 1 / distance from the surface at level 0 of the first picture.
         first: Texel at which each level starts.
         texels: Of one picture.
     """
 
     color: wp.array(dtype=wp.vec4)
-    nearness: wp.array(dtype=float)
     first: wp.array(dtype=int)
     texels: int
     x0: int
@@ -53,42 +51,6 @@ def level_of(pyramid: Pyramid, width: float) -> int:
 
 
 @wp.func
-def texel_at(pyramid: Pyramid, x: int, y: int) -> wp.vec4:
-    """A texel of the first picture; nothing beyond the bounds."""
-    texel = wp.vec4(0.0, 0.0, 0.0, 0.0)
-    if x >= 0 and y >= 0 and x < pyramid.width and y < pyramid.height:
-        texel = pyramid.color[y * pyramid.width + x]
-    return texel
-
-
-@wp.func
-def look_up(pyramid: Pyramid, x: float, y: float) -> wp.vec4:
-    """Bilinear look-up of the first picture's colour at a pixel coordinate relative to the bounds."""
-    left = wp.floor(x - 0.5)
-    top = wp.floor(y - 0.5)
-    right_share = x - 0.5 - left
-    bottom_share = y - 0.5 - top
-    tx = int(left)
-    ty = int(top)
-    upper = (1.0 - right_share) * texel_at(pyramid, tx, ty) + right_share * texel_at(pyramid, tx + 1, ty)
-    lower = (1.0 - right_share) * texel_at(pyramid, tx, ty + 1) + right_share * texel_at(pyramid, tx + 1, ty + 1)
-    return (1.0 - bottom_share) * upper + bottom_share * lower
-
-
-@wp.func
-def nearness_at(pyramid: Pyramid, x: float, y: float, otherwise: float) -> float:
-    """Nearness of the first picture's nearest texel; `otherwise` where the surface is not seen there."""
-    tx = int(wp.floor(x))
-    ty = int(wp.floor(y))
-    result = otherwise
-    if tx >= 0 and ty >= 0 and tx < pyramid.width and ty < pyramid.height:
-        texel = ty * pyramid.width + tx
-        if pyramid.color[texel][3] > 0.0:
-            result = pyramid.nearness[texel]
-    return result
-
-
-@wp.func
 def look_up_level(pyramid: Pyramid, picture: int, x: float, y: float, level: int) -> wp.vec4:
     """Bilinear look-up of a picture's colour at a level; nothing beyond the bounds."""
     width = level_size(pyramid.width, level)
@@ -107,22 +69,6 @@ def look_up_level(pyramid: Pyramid, picture: int, x: float, y: float, level: int
             share = (1.0 - wp.abs(sx - float(tx))) * (1.0 - wp.abs(sy - float(ty)))
             found += share * pyramid.color[start + ty * width + tx]
     return found
-
-
-@wp.kernel
-def fill_kernel(
-    first: int,
-    image_width: int,
-    pixel: wp.array(dtype=int),
-    radiance: wp.array(dtype=wp.vec3),
-    nearness: wp.array(dtype=float),
-    out_pyramid: Pyramid,
-):
-    """One thread per pixel."""
-    i = first + wp.tid()
-    texel = texel_of(out_pyramid, pixel[i], image_width)
-    out_pyramid.color[texel] = wp.vec4(radiance[i][0], radiance[i][1], radiance[i][2], 1.0)
-    out_pyramid.nearness[texel] = nearness[i]
 
 
 @wp.kernel
@@ -146,26 +92,6 @@ def halve_kernel(first: int, level: int, out_pyramid: Pyramid):
     out_pyramid.color[start + out_pyramid.first[level] + texel] = color
 
 
-def make_picture(
-    pixels: MirrorPixels, radiance: wp.array, nearness: wp.array, image_width: int, threads: int = 0
-) -> Pyramid:
-    """The picture of what a surface's pixels see, at level 0 alone.
-
-    Args:
-        pixels: At which the surface is seen.
-        radiance: vec3 [n].
-        nearness: float [n], 1 / distance from the surface, 0 for the sky.
-        image_width: Of the frame. [pixels]
-        threads: CPU threads; 0: one per core.
-    """
-    pyramid = empty_pyramid(pixels, radiance.device)
-    pyramid.nearness = wp.zeros(pyramid.texels, dtype=float, device=radiance.device)
-    launch.launch(
-        fill_kernel, pixels.count, [image_width, pixels.pixel, radiance, nearness, pyramid], radiance.device, threads
-    )
-    return pyramid
-
-
 def empty_pyramid(pixels: MirrorPixels, device, pictures: int = 1, levels: int = 1) -> Pyramid:
     """Room for pictures of a surface.
 
@@ -183,7 +109,6 @@ def empty_pyramid(pixels: MirrorPixels, device, pictures: int = 1, levels: int =
     sizes = [_level_texels(pyramid, level) for level in range(levels)]
     pyramid.texels = sum(sizes)
     pyramid.color = wp.zeros(pictures * pyramid.texels, dtype=wp.vec4, device=device)
-    pyramid.nearness = wp.zeros(0, dtype=float, device=device)
     pyramid.first = wp.array(np.cumsum([0, *sizes[:-1]]).astype(np.int32), dtype=int, device=device)
     return pyramid
 

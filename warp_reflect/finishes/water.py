@@ -15,12 +15,12 @@ from __future__ import annotations
 
 import warp as wp
 
-from warp_reflect import bvh, launch, shade
-from warp_reflect.finishes.pyramid import Pyramid, look_up, make_picture, nearness_at
+from warp_reflect import bvh, launch, shade, vector
+from warp_reflect.finishes.still_picture import StillPicture, look_up, make_picture, nearness_at
 from warp_reflect.layers import CameraView, MirrorPixels, ReflectionLayer
 from warp_reflect.optics import refract
-from warp_reflect.scene import Scene, SceneView
-from warp_reflect.shapes import facet_normal, unit
+from warp_reflect.scene import Scene
+from warp_reflect.shapes import unit
 from warp_reflect.surface import shown_normal, turned_reflection
 from warp_reflect.transmission import Through, Transmission, look_through, through_radiance
 
@@ -47,11 +47,11 @@ def seen_at(camera: CameraView, p_eye: wp.vec3, own: wp.vec2) -> wp.vec2:
 
 
 @wp.func
-def shifted_radiance(pyramid: Pyramid, own: wp.vec2, at: wp.vec2, otherwise: wp.vec3) -> wp.vec3:
+def shifted_radiance(picture: StillPicture, own: wp.vec2, at: wp.vec2, otherwise: wp.vec3) -> wp.vec3:
     """The picture at a place; nearer to the pixel's own where the surface is not seen there."""
     shift = at - own
     for _step in range(RETREATS):
-        found = look_up(pyramid, own[0] + shift[0], own[1] + shift[1])
+        found = look_up(picture, own[0] + shift[0], own[1] + shift[1])
         if found[3] >= EVEN_COVERAGE:
             return wp.vec3(found[0], found[1], found[2]) / found[3]
         shift = 0.5 * shift
@@ -59,68 +59,36 @@ def shifted_radiance(pyramid: Pyramid, own: wp.vec2, at: wp.vec2, otherwise: wp.
 
 
 @wp.kernel
-def mirrored_height_kernel(
-    first: int,
-    triangle: wp.array(dtype=int),
-    distance: wp.array(dtype=float),
-    direction: wp.array(dtype=wp.vec3),
-    normal: wp.array(dtype=wp.vec3),
-    out_nearness: wp.array(dtype=float),
-):
-    """One thread per mirror pixel: 1 / height of what it shows over the surface, 0 for the sky."""
-    i = first + wp.tid()
-    out_nearness[i] = 0.0
-    height = distance[i] * wp.abs(wp.dot(direction[i], normal[i]))
-    if triangle[i] >= 0 and height > 0.0:
-        out_nearness[i] = 1.0 / height
-
-
-@wp.kernel
-def refracted_depth_kernel(
-    first: int,
-    nearness: wp.array(dtype=float),
-    direction: wp.array(dtype=wp.vec3),
-    normal: wp.array(dtype=wp.vec3),
-    out_nearness: wp.array(dtype=float),
-):
-    """One thread per pixel: 1 / depth of what it shows below the surface."""
-    i = first + wp.tid()
-    out_nearness[i] = nearness[i] / wp.max(wp.abs(wp.dot(direction[i], normal[i])), LEAST_DEPTH)
-
-
-@wp.kernel
 def reflect_waves_kernel(
     first: int,
     camera: CameraView,
     normals: wp.array(dtype=wp.vec3),
-    pyramid: Pyramid,
+    picture: StillPicture,
     # Mirror pixels:
     pixel: wp.array(dtype=int),
     point: wp.array(dtype=wp.vec3),
     normal: wp.array(dtype=wp.vec3),
     direction: wp.array(dtype=wp.vec3),
-    nearness: wp.array(dtype=float),
     radiance: wp.array(dtype=wp.vec3),
     out_radiance: wp.array(dtype=wp.vec3),
 ):
     """One thread per mirror pixel."""
     i = first + wp.tid()
     row = pixel[i] // camera.width
-    corner = wp.vec2(float(pyramid.x0), float(pyramid.y0))
     own = wp.vec2(float(pixel[i] - row * camera.width) + 0.5, float(row) + 0.5)
     n = normal[i]
     to_point = point[i] - camera.eye
     turned = turned_reflection(direction[i], n, shown_normal(normals, pixel[i], n))
     # What the turned ray meets stands, to the eye, where its mirror image in the still plane does.
-    behind = turned - 2.0 * wp.dot(turned, n) * n
-    least = LEAST_NEARNESS / wp.max(wp.length(to_point), LEAST_DEPTH)
-    near = nearness[i]
     rise = wp.dot(turned, n)
+    behind = turned - 2.0 * rise * n
+    least = LEAST_NEARNESS / wp.max(wp.length(to_point), LEAST_DEPTH)
+    near = nearness_at(picture, own[0], own[1], 0.0)
     at = own
     for _step in range(MIRROR_STEPS):
         at = seen_at(camera, to_point + behind / wp.max(near * rise, least), own)
-        near = nearness_at(pyramid, at[0] - corner[0], at[1] - corner[1], near)
-    out_radiance[i] = shifted_radiance(pyramid, own - corner, at - corner, radiance[i])
+        near = nearness_at(picture, at[0], at[1], near)
+    out_radiance[i] = shifted_radiance(picture, own, at, radiance[i])
 
 
 @wp.func
@@ -157,35 +125,31 @@ def crossing_point(near_it: wp.vec3, n: wp.vec3, target: wp.vec3, ior: float) ->
 @wp.kernel
 def refract_waves_kernel(
     first: int,
-    scene: SceneView,
     camera: CameraView,
     normals: wp.array(dtype=wp.vec3),
-    triangle: wp.array(dtype=int),
+    inside: wp.array(dtype=wp.uint8),
     ior: float,
-    pyramid: Pyramid,
+    picture: StillPicture,
     # Pixels of the surface, with the normals on the far side:
     pixel: wp.array(dtype=int),
     point: wp.array(dtype=wp.vec3),
     normal: wp.array(dtype=wp.vec3),
-    nearness: wp.array(dtype=float),
     radiance: wp.array(dtype=wp.vec3),
     out_radiance: wp.array(dtype=wp.vec3),
 ):
     """One thread per pixel of the surface; an eye behind it has its turned rays already."""
     i = first + wp.tid()
     out_radiance[i] = radiance[i]
-    tri = scene.triangles[triangle[pixel[i]]]
-    outward = facet_normal(scene.points[tri[0]], scene.points[tri[1]], scene.points[tri[2]])
     n = -normal[i]
-    if wp.dot(outward, n) <= 0.0:
-        return
     row = pixel[i] // camera.width
-    corner = wp.vec2(float(pyramid.x0), float(pyramid.y0))
     own = wp.vec2(float(pixel[i] - row * camera.width) + 0.5, float(row) + 0.5)
     to_point = point[i] - camera.eye
     incident = camera.forward
     if camera.orthographic == 0:
         incident = unit(to_point)
+    # Rays that are in the body, totally reflected there, came from it.
+    if int(inside[i]) == 0 or wp.dot(incident, n) >= 0.0:
+        return
     bent = refract(incident, shown_normal(normals, pixel[i], n), ior)
     if not (wp.dot(bent, n) < 0.0):
         return
@@ -194,7 +158,7 @@ def refract_waves_kernel(
     if camera.orthographic != 0:
         still = refract(incident, n, ior)
     least = LEAST_NEARNESS / wp.max(wp.length(to_point), LEAST_DEPTH)
-    near = nearness[i]
+    near = nearness_at(picture, own[0], own[1], 0.0)
     at = own
     crossing = to_point
     for _step in range(REFRACTION_STEPS):
@@ -205,8 +169,8 @@ def refract_waves_kernel(
         else:
             way = wp.dot(target - to_point, n) / wp.dot(still, n)
             at = seen_at(camera, target - way * still, own)
-        near = nearness_at(pyramid, at[0] - corner[0], at[1] - corner[1], near)
-    out_radiance[i] = shifted_radiance(pyramid, own - corner, at - corner, radiance[i])
+        near = nearness_at(picture, at[0], at[1], near)
+    out_radiance[i] = shifted_radiance(picture, own, at, radiance[i])
 
 
 @wp.kernel
@@ -230,13 +194,17 @@ def apply(
     pixels, threads, device = layer.pixels, row.settings.threads, scene.device
     if row.settings.waves == "traced" and layer.radiance is None:
         return traced(scene, shown, layer, row)
-    nearness = wp.empty(pixels.count, dtype=float, device=device)
-    hits = [layer.triangle, layer.distance, pixels.direction, pixels.normal, nearness]
-    launch.launch(mirrored_height_kernel, pixels.count, hits, device, threads)
-    picture = make_picture(pixels, radiance, nearness, shown.gbuffer.camera.size[0], threads)
+    width, hits = shown.gbuffer.camera.size[0], (layer.triangle, layer.distance)
+    picture = make_picture(pixels, radiance, width, hits=hits, threads=threads, kernels=row.settings.kernels)
     wavy = wp.empty(pixels.count, dtype=wp.vec3, device=device)
     inputs = [shown.gbuffer.view, shown.normals, picture, pixels.pixel, pixels.point, pixels.normal, pixels.direction]
-    launch.launch(reflect_waves_kernel, pixels.count, [*inputs, nearness, radiance, wavy], device, threads)
+    inputs += [radiance, wavy]
+    if vector.chosen(row.settings.kernels, device):
+        from warp_reflect.finishes import water_vector  # which works with this module's constants
+
+        vector.launch_blocks(water_vector.reflect_blocks_kernel, pixels.count, inputs, device, threads)
+    else:
+        launch.launch(reflect_waves_kernel, pixels.count, inputs, device, threads)
     return wavy
 
 
@@ -257,16 +225,19 @@ def apply_through(scene: Scene, through: Through, found: Transmission, radiance:
     """What is seen through a surface with waves, see `finishes`."""
     pixels, settings, shown = found.layer.pixels, pane.settings, through.shown
     if settings.waves == "traced":
-        turned = look_through(scene, shown, through.interfaces, pixels.pixel.numpy(), settings, wavy=True)
+        turned = look_through(scene, shown, through.interfaces, found.surface, settings, wavy=True)
         found.layer, found.nearness = turned.layer, turned.nearness
         return through_radiance(scene, through, found, settings)
-    nearness = wp.empty(pixels.count, dtype=float, device=scene.device)
-    ways = [found.nearness, pixels.direction, pixels.normal, nearness]
-    launch.launch(refracted_depth_kernel, pixels.count, ways, scene.device, settings.threads)
-    picture = make_picture(pixels, radiance, nearness, shown.gbuffer.camera.size[0], settings.threads)
+    width, kernels = shown.gbuffer.camera.size[0], settings.kernels
+    picture = make_picture(pixels, radiance, width, found.nearness, threads=settings.threads, kernels=kernels)
     wavy = wp.empty(pixels.count, dtype=wp.vec3, device=scene.device)
     ior = scene.data.materials[scene.parts[pane.part].material].ior
-    inputs = [scene.view, shown.gbuffer.view, shown.normals, shown.gbuffer.triangle, ior, picture]
-    inputs += [pixels.pixel, pixels.point, pixels.normal, nearness, radiance, wavy]
-    launch.launch(refract_waves_kernel, pixels.count, inputs, scene.device, settings.threads)
+    inputs = [shown.gbuffer.view, shown.normals, found.inside, ior, picture]
+    inputs += [pixels.pixel, pixels.point, pixels.normal, radiance, wavy]
+    if vector.chosen(kernels, scene.device):
+        from warp_reflect.finishes import water_vector
+
+        vector.launch_blocks(water_vector.refract_blocks_kernel, pixels.count, inputs, scene.device, settings.threads)
+    else:
+        launch.launch(refract_waves_kernel, pixels.count, inputs, scene.device, settings.threads)
     return wavy

@@ -118,7 +118,7 @@ def reflect(
 
 def _draw(scene: Scene, part: int, centre: np.ndarray, settings: Settings, before=None) -> tuple[CubeMaps, int]:
     resolution = settings.environment_resolution
-    options = {"shadows": asked_shadows(scene, settings), "threads": settings.threads}
+    options = {"shadows": asked_shadows(scene, settings), "threads": settings.threads, "kernels": settings.kernels}
     onward = onward_of(scene, part, settings, before)
     return render_maps(scene, centre[None], resolution, without=[left_out(scene, part)], onward=onward, **options), 0
 
@@ -145,7 +145,7 @@ def onward_of(scene: Scene, part: int, settings: Settings, before: dict[int, Sho
     return mirror_maps.of_depth(scene, settings, settings.bounces - 1)
 
 
-def parallax_px(scene: Scene, reflector, camera: Camera, threads: int = 0) -> float:
+def parallax_px(scene: Scene, reflector, camera: Camera, threads: int = 0, kernels: str = "auto") -> float:
     """How many pixels off an environment map at a mirror's centre shows things.
 
     In a small picture each mirror pixel's ray is followed from the centre instead of the mirror: the point met is what the
@@ -156,11 +156,12 @@ def parallax_px(scene: Scene, reflector, camera: Camera, threads: int = 0) -> fl
         reflector: The mirror.
         camera: Whose pixels count.
         threads: CPU threads; 0: one per core.
+        kernels: `Settings.kernels`.
 
     Returns:
         The error below which `QUANTILE` of the mirror's pixels stay; 0 where it is not seen.
     """
-    number, point, ray, width, shrink = _preview(scene, reflector, camera, threads)
+    number, point, ray, width, shrink = _preview(scene, reflector, camera, threads, kernels)
     if not len(number) or not scene.tracer.id:
         return 0.0
     centre = centre_of(scene, reflector.part) - scene.origin
@@ -193,16 +194,17 @@ def parallax_px(scene: Scene, reflector, camera: Camera, threads: int = 0) -> fl
     return float(min(np.quantile(step, QUANTILE), width) * shrink)
 
 
-def _preview(scene: Scene, reflector, camera: Camera, threads: int):
+def _preview(scene: Scene, reflector, camera: Camera, threads: int, kernels: str):
     """A small picture of a mirror: its pixels' numbers, points, reflected rays; the picture's width; how often it is smaller."""
     shrink = max(1.0, max(camera.size) / PREVIEW_SIDE)
     size = tuple(max(1, round(side / shrink)) for side in camera.size)
     scaled = {name: getattr(camera, name) / shrink for name in ("fx", "fy", "cx", "cy")}
     of, gbuffer = scene.facts.get(("preview", None), (None, None))
     if of is not camera:  # else it was drawn for another mirror of the same plan
-        gbuffer = raster.draw_scene(scene, dataclasses.replace(camera, size=size, **scaled), threads)
+        small = dataclasses.replace(camera, size=size, **scaled)
+        gbuffer = raster.draw_scene(scene, small, threads, kernels=kernels)
         scene.facts["preview", None] = camera, gbuffer
-    found, _ = surface.mirror_pixels(scene, gbuffer, {reflector.id: reflector.part}, threads)
+    found, _ = surface.mirror_pixels(scene, gbuffer, {reflector.id: reflector.part}, threads, kernels)
     pixels = found[reflector.id]
     point, ray = (array.numpy().astype(np.float64) for array in (pixels.point, pixels.direction))
     return pixels.pixel.numpy(), point, ray, size[0], shrink

@@ -86,6 +86,7 @@ def of_depth(scene: Scene, settings: Settings, depth: int) -> Onward:
             onward=deeper,
             shadows=shadows,
             threads=settings.threads,
+            kernels=settings.kernels,
         )
     return _onward(scene, [(part, scene.environments[key], k) for k, part in enumerate(parts)], settings.threads)
 

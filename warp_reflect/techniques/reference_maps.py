@@ -223,6 +223,7 @@ def draw_maps(scene: Scene, placement: Placement, settings: Settings) -> CubeMap
         without=[left_out(scene, centre, settings) for centre in placement.centres],
         shadows=asked_shadows(scene, settings),
         threads=settings.threads,
+        kernels=settings.kernels,
     )
 
 
