@@ -20,10 +20,12 @@ FILES = {
 
 # A module imports from its own floor or below. A new module belongs into this table; `x.*` is a folder.
 FLOORS = {
-    1: "settings launch vector devices optics shapes bodies cubemap quadrics quadric_roots quadric_curve quadric_fit heightfield "
+    1: "settings launch vector devices optics shapes bodies topology "
+    "cubemap quadrics quadric_roots quadric_curve quadric_fit heightfield "
     "grid_rays occupancy voxels "
     "images metrics timing clipping cutouts",
-    2: "scene reflectors environment_maps baked_maps segments layers bvh raster raster_vector shade shade_vector surface "
+    2: "scene scene_times reflectors environment_maps baked_maps "
+    "segments layers bvh raster raster_vector shade shade_vector surface "
     "surface_vector pictures textures holes cut_shadows "
     "normal_maps bounces direct shadows transmission transmission_vector waves waves_vector channels stage stage.* scene_field "
     "baked_environments",

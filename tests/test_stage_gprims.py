@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from warp_reflect.scene import edge_neighbours
 from warp_reflect.stage import gprims
+from warp_reflect.topology import edge_neighbours
 
 # Each solid, its volume, and how many patches it has.
 SOLIDS = {

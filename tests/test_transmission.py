@@ -224,7 +224,7 @@ def test_clear_glass_casts_no_shadow(transmission, shadowed):
     sun.world_from_light[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]  # shines down
     pane = square(1, 1.0), placed(0, 3.0, -1.0), dataclasses.replace(GLASS, transmission=transmission)
     scenes = [stage(*things, sky=0.2) for things in ((), (pane,))]
-    lit = [type(each)(dataclasses.replace(each._source, lights=[*each._source.lights, sun])) for each in scenes]
+    lit = [type(each)(dataclasses.replace(each.source_data, lights=[*each.source_data.lights, sun])) for each in scenes]
     bare, covered = (frame(each, shadows="on")["RGBA"][..., 0] for each in lit)
     below = np.zeros(SIZE[::-1], bool)
     floor = frame(lit[1])["primId"] == 1

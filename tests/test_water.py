@@ -22,7 +22,7 @@ POOL = square(1, 20.0), placed(0, 0, -3)
 
 
 def at_time(scene, time):
-    return scene.seen_at(dataclasses.replace(scene._source, time=time))
+    return scene.seen_at(dataclasses.replace(scene.source_data, time=time))
 
 
 def reflected_places(shown, mask):
@@ -36,7 +36,7 @@ def test_the_mirrored_picture_is_looked_up_where_the_turned_rays_lead():
     """A coded wall behind the water: waves move its picture by many pixels, look-ups are off by few of that."""
     scene = stage((*POOL, dataclasses.replace(WAVY, transmission=0.0, metallic=1.0, base_color=(1.0,) * 3)), sky=1.0)
     # The floor of the scene, stood up behind the water.
-    data = scene._source
+    data = scene.source_data
     turn = upright(0.0)[1]
     turn[1, 3], turn[2, 3] = 7.9, -8.0
     data.instances[0] = dataclasses.replace(data.instances[0], world_from_object=turn)

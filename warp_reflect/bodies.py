@@ -9,6 +9,9 @@ import numpy as np
 # Of the body's size. A tessellated convex body has facets that stick out over their neighbours by rounding: float32
 # points of a unit body carry 6e-8, and facets of 1/100 the body's size lever that up to 1e-5.
 CONVEX_TOLERANCE = 2.0e-5
+SIMILARITY_TOLERANCE = (
+    1.0e-9  # a rotation authored in float64 is off by 1e-15, in float32 by 1e-7: that one is looked at
+)
 SOLID_ANGLE_TOLERANCE = 1.0e-3  # of 4 pi; a second shell or an opening changes it by far more
 
 
@@ -34,13 +37,37 @@ class Body:
     extent: np.ndarray
     reason: str
 
+    def placed(self, scene_from_object: np.ndarray) -> Body:
+        """The same body placed by a similarity (`is_similarity`), float64 [4, 4]."""
+        linear = scene_from_object[:3, :3]
+        scale = float(np.cbrt(abs(np.linalg.det(linear))))
+        axes = self.axes @ (linear / scale).T
+        if np.linalg.det(axes) < 0.0:
+            axes[2] *= -1.0
+        centre = linear @ self.centre + scene_from_object[:3, 3]
+        return replace(self, centre=centre, axes=axes, extent=self.extent * scale)
+
+
+def is_similarity(matrix: np.ndarray) -> bool:
+    """Whether a matrix turns, mirrors, shifts and scales alike in all directions, float64 [4, 4]."""
+    gram = matrix[:3, :3].T @ matrix[:3, :3]
+    square = float(np.trace(gram)) / 3.0
+    return square > 0.0 and bool(np.abs(gram - square * np.eye(3)).max() <= SIMILARITY_TOLERANCE * square)
+
 
 def weld(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Triangles over the first of all points with bit-equal coordinates, int64 [triangle_count, 3]."""
     rows = np.ascontiguousarray(points, dtype=np.float32) + np.float32(0.0)  # -0 becomes +0
-    keys = rows.view(np.dtype((np.void, rows.dtype.itemsize * 3))).reshape(-1)
-    _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
-    return first[inverse.reshape(-1)][triangles].astype(np.int64)
+    if not len(rows):
+        return np.zeros((len(triangles), 3), np.int64)
+    bits = rows.view(np.uint32).astype(np.uint64)
+    order = np.lexsort((bits[:, 2], (bits[:, 0] << np.uint64(32)) | bits[:, 1]))
+    ordered = bits[order]
+    starts = np.append(True, (ordered[1:] != ordered[:-1]).any(axis=1))
+    # The sort is stable: the first of a run of equals has the lowest number.
+    first = np.empty(len(rows), np.int64)
+    first[order] = order[starts][np.cumsum(starts) - 1]
+    return first[triangles]
 
 
 def analyse(points: np.ndarray, triangles: np.ndarray) -> Body:

@@ -250,7 +250,7 @@ def render_frame(scene: Scene, plan: Plan, camera: str | Camera | None = None, p
         A `Frame`.
     """
     timer = StageTimer(scene.device)
-    plan = plan.at(scene)
+    plan = plan.at(scene, None if previous is None else previous.plan)
     if previous is not None and not previous.kept:
         plan = keep_pace(plan, previous.plan, previous.spent)
     settings = plan.settings

@@ -180,13 +180,20 @@ class Plan:
             self._prepared[row.reflector.id] = technique.prepare(self.scene, row.reflector, row.settings)
         return self._prepared[row.reflector.id]
 
-    def at(self, scene: Scene) -> Plan:
-        """The plan for its stage at another time: decided anew, with its own camera there."""
+    def at(self, scene: Scene, last: Plan | None = None) -> Plan:
+        """The plan for its stage at another time: decided anew, with its own camera there.
+
+        Args:
+            scene: The stage then.
+            last: Of a time nearer to that one; what it prepared is taken over where it was made for the same request.
+        """
         if scene is self.scene:
             return self
+        same = last is not None and (last.settings, last.method, last.size) == (self.settings, self.method, self.size)
         moving = any(camera.path == self.camera.path for camera in scene.data.cameras)
         camera = self.camera.path if moving else self.camera
-        return make_plan(scene, camera, self.size, self.settings, self.method, earlier=self, costs=self.costs)
+        earlier = last if same else self
+        return make_plan(scene, camera, self.size, self.settings, self.method, earlier=earlier, costs=self.costs)
 
     def to_json(self) -> dict:
         """The plan as `warp-reflect plan --json` prints it."""
@@ -341,6 +348,9 @@ def make_plan(
         near = difflib.get_close_matches(method, [*METHODS, *TECHNIQUES], n=3, cutoff=0.3)
         raise ValueError(f"unknown method '{method}'; nearest: {', '.join(near or [*METHODS, *TECHNIQUES])}")
     view = find_camera(scene, camera, size)
+    if earlier is not None and not earlier.scene.shares_world(scene):
+        for name in {row.technique for row in earlier.rows} & set(OF_ALL_TIMES):
+            TECHNIQUES[name].take_over(earlier.scene, scene)
     notes: list[Note] = []
     weights = _weights(scene, settings) if method != "none" else {}
     found = [(k, part, weight) for k, part in enumerate(scene.parts) if (weight := weights.get(part.material, 0.0))]
@@ -478,11 +488,7 @@ def with_techniques(plan: Plan, techniques: Mapping[int, str]) -> Plan:
 
 def _take_over(made: Plan, earlier: Plan | None) -> None:
     """Hand over what an earlier plan's techniques prepared, where it is still that."""
-    if earlier is None:
-        return
-    if not earlier.scene.shares_world(made.scene):
-        for name in {row.technique for row in made.rows} & set(OF_ALL_TIMES):
-            TECHNIQUES[name].take_over(earlier.scene, made.scene)
+    if earlier is None or not earlier.scene.shares_world(made.scene):
         return
     before = {row.reflector: row for row in earlier.rows}
     for row in made.rows:

@@ -8,15 +8,16 @@ Matrices act on columns: `p_world = world_from_object @ [p, 1]`.
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 import warp as wp
 
 from warp_reflect.baked_maps import BakedMap
-from warp_reflect.bodies import Body, analyse, weld
+from warp_reflect.bodies import Body, analyse, is_similarity
 from warp_reflect.cutouts import Cutouts, no_cutouts
+from warp_reflect.topology import closed_ranges, joined_neighbours
 
 wp.set_module_options({"enable_backward": False})
 
@@ -321,33 +322,52 @@ class Scene:
         notes: What the user should know, one `Note` each.
     """
 
-    def __init__(self, data: SceneData, device: str = "cpu", reload=None):
-        self.data = self._source = data
+    def __init__(self, data: SceneData, device: str = "cpu", reload=None, earlier: Scene | None = None):
+        """Put a stage's arrays on a device.
+
+        Args:
+            data: The arrays.
+            device: Warp device.
+            reload: Reads the stage at another time, see `at`.
+            earlier: The same stage at another time: what does not move is shared with it.
+        """
+        self.data = self.source_data = data  # the latter as it was read
         self.device = wp.get_device(device)
         self.notes = list(data.notes)
         self._reload = reload
-        self._bodies: dict[int, Body] = {}
-        self._part_tracers: dict = {}
-        self._mirror_tracers: dict = {}  # material -> the structure over what a mirror of it may show
-        self._seen: dict[int, np.ndarray] = {}  # material -> which triangles a mirror of it may show
+        self.bodies: dict[int, Body] = {}
+        self.bodies_in_place: dict = {}  # (mesh, which of its parts) of what moves -> its body, in the frame of the mesh
+        self.part_tracers: dict = {}
+        self.mirror_tracers: dict = {}  # material -> the structure over what a mirror of it may show
+        self.seen: dict[int, np.ndarray] = {}  # material -> which triangles a mirror of it may show
         self.fits: dict = {}  # part -> the quadric nearest to it, found by the technique that asks
         self.segmentations: dict = {}  # part -> its sheets (`segments.Segmentation`), likewise
-        self.facts: dict = {}  # (what, which part) -> what a technique found out about its shape: plans ask again and again
+        self.facts: dict = {}  # (what, first triangle of a part) -> what a technique found out about its shape
         self.environments: dict = {}  # environment maps that several mirrors share, by what they were drawn with
-        self._pyramids: dict = {}
+        self.pyramids: dict = {}
+        self.material_notes: list[Note] = []  # of what was met when the materials were prepared
+        self.known_textures: tuple | None = None  # (`textures`, `texture_notes`) of another time
+        self.origin = _scene_origin(data)
+        if earlier is not None:
+            from warp_reflect import scene_times
+
+            moved = scene_times.moved_instances(earlier.source_data, data)
+            if moved is not None:
+                scene_times.lay_out(self, earlier, moved)
+                return
         if any(material.textures for material in data.materials):
             from warp_reflect import pictures
 
-            materials, notes, self._pyramids = pictures.mirror_constants(data)
+            materials, notes, self.pyramids = pictures.mirror_constants(data)
             self.data = data = replace(data, materials=materials)
             self.notes += [note for note in notes if note not in self.notes]
-        self.origin = _scene_origin(data)
         self._flatten()
         self.view.cuts = no_cutouts(self.device)
         if any(material.opacity_threshold > 0.0 for material in data.materials):
             from warp_reflect import holes
 
-            self.view.cuts = holes.prepare_cutouts(self, self._pyramids)
+            self.view.cuts = holes.prepare_cutouts(self, self.pyramids)
+        self.material_notes = self.notes[len(data.notes) :]
 
     @property
     def triangle_count(self) -> int:
@@ -368,9 +388,8 @@ class Scene:
     @cached_property
     def size(self) -> float:
         """Length of the diagonal of the bounds, in scene units."""
-        if not self.vertex_count:
-            return 1.0
-        return float(np.linalg.norm(np.ptp(self.host_points.astype(np.float64), axis=0))) or 1.0
+        corners = self.boxes[2].reshape(-1, 3)
+        return (float(np.linalg.norm(np.ptp(corners, axis=0))) if len(corners) else 0.0) or 1.0
 
     def at(self, time: float | None) -> Scene:
         """The same stage at another time code.
@@ -384,12 +403,14 @@ class Scene:
 
     def seen_at(self, data: SceneData) -> Scene | None:
         """This scene with the time, cameras and notes of `data`; None where more than those differ."""
-        if not same_world(self._source, data):
+        from warp_reflect.scene_times import same_world
+
+        if not same_world(self.source_data, data):
             return None
         other = copy.copy(self)
         other.data = replace(self.data, time=data.time, cameras=data.cameras, notes=data.notes)
-        other.notes = [*data.notes, *self.notes[len(self._source.notes) :]]
-        other._source = data
+        other.notes = [*data.notes, *self.notes[len(self.source_data.notes) :]]
+        other.source_data = data
         return other
 
     def shares_world(self, other: Scene) -> bool:
@@ -403,34 +424,45 @@ class Scene:
         return cut >= 0 if len(cut) else None
 
     @cached_property
-    def _host_neighbours(self) -> np.ndarray:
-        # Welded: the seams of gprims and of faceVarying exports must not stop a walk.
-        return edge_neighbours(weld(self.host_points, self.host_triangles))
+    def host_neighbours(self) -> np.ndarray:
+        """As `neighbours`; what moves is joined with itself alone, so that they are the same at every time."""
+        ranges: dict[int, slice] = {}
+        for part in (self.parts[k] for k in self.moving_parts):
+            first = ranges[part.prim].start if part.prim in ranges else part.first_triangle
+            ranges[part.prim] = slice(first, part.first_triangle + part.triangle_count)
+        return joined_neighbours(self._points_at_rest, self.host_triangles, list(ranges.values()))
 
     @cached_property
     def neighbours(self) -> wp.array:
         """vec3i [triangle_count]: the triangle across each edge (v0v1, v1v2, v2v0), -1 where there is none."""
-        return wp.array(self._host_neighbours, dtype=wp.vec3i, device=self.device)
+        return wp.array(self.host_neighbours, dtype=wp.vec3i, device=self.device)
 
     @cached_property
     def closed_patches(self) -> wp.array:
         """int32 [patches]: 1 where the part is closed and wound outwards: no ray from outside meets its back first."""
-        across = self._host_neighbours
+        first, count = (
+            np.array([getattr(p, name) for p in self.parts], int) for name in ("first_triangle", "triangle_count")
+        )
+        is_closed = closed_ranges(self._points_at_rest, self.host_triangles, self.host_neighbours, first, count)
         closed = np.zeros(max(len(self.patch_shapes), 1), np.int32)
-        corner = self.host_points[self.host_triangles].astype(np.float64)
-        volume = np.einsum("ij,ij->i", corner[:, 0], np.cross(corner[:, 1], corner[:, 2]))
-        for part in self.parts:
-            own = slice(part.first_triangle, part.first_triangle + part.triangle_count)
-            beyond = across[own]
-            inside = (beyond >= own.start) & (beyond < own.stop)
-            middle = corner[own].reshape(-1, 3).mean(axis=0) if part.triangle_count else np.zeros(3)
-            area = np.cross(corner[own][:, 1] - corner[own][:, 0], corner[own][:, 2] - corner[own][:, 0])
-            # The volume about the part's own middle: about a far origin it would cancel.
-            outward = volume[own].sum() - float(area.sum(axis=0) @ middle) > 0.0
-            whole = self.has_hole is None or not self.has_hole[own].any()
-            if part.triangle_count and inside.all() and outward and whole:
+        for k in np.flatnonzero(is_closed):
+            part = self.parts[k]
+            if self.has_hole is None or not self.has_hole[part.first_triangle :][: part.triangle_count].any():
                 closed[list(part.patches)] = 1
         return wp.array(closed, dtype=int, device=self.device)
+
+    @property
+    def _points_at_rest(self) -> np.ndarray:
+        """`host_points`, those of what moves as the frame of its mesh has them, mirrored where it is: the same at every time."""
+        if not self.moving_parts:
+            return self.host_points
+        points, (first, _) = self.host_points.copy(), first_rows(self.data)
+        for k, instance in enumerate(self.data.instances):
+            if instance.moves:
+                own = self.data.meshes[instance.mesh].points
+                mirrored = np.linalg.det(instance.world_from_object[:3, :3]) < 0.0
+                points[first[k] : first[k] + len(own)] = own * np.float32([-1.0 if mirrored else 1.0, 1.0, 1.0])
+        return points
 
     @cached_property
     def triangle_records(self) -> wp.array:
@@ -447,10 +479,7 @@ class Scene:
         if not spans:
             return np.zeros(0, int), np.zeros(0, int), np.zeros((0, 8, 3))
         first, count = np.array(spans).T
-        low = np.minimum.reduceat(self.host_points, first, axis=0).astype(np.float64)
-        high = np.maximum.reduceat(self.host_points, first, axis=0).astype(np.float64)
-        bits = (np.arange(8)[:, None] >> np.arange(3)) & 1
-        return first, count, np.where(bits[None] == 1, high[:, None], low[:, None])
+        return first, count, box_corners(self.host_points, first)
 
     @cached_property
     def tracer(self):
@@ -464,14 +493,14 @@ class Scene:
         mirror = self.data.materials[part.material].mirror
         if mirror is None or mirror.reflects is None:
             return None
-        if part.material not in self._seen:
+        if part.material not in self.seen:
             members = frozenset(mirror.reflects)
             seen = np.zeros(self.triangle_count, bool)
             for other in self.parts:
                 if other.prim_path in members or (other.instance and other.instance.partition(":")[0] in members):
                     seen[other.first_triangle : other.first_triangle + other.triangle_count] = True
-            self._seen[part.material] = seen
-        return self._seen[part.material]
+            self.seen[part.material] = seen
+        return self.seen[part.material]
 
     def mirror_tracer(self, part: int):
         """The owner of the structure for the rays of a mirror: the scene's, or one over what it may show (`seen_in`)."""
@@ -481,17 +510,17 @@ class Scene:
         if seen is None:
             return self.tracer
         material = self.parts[part].material
-        if material not in self._mirror_tracers:
-            self._mirror_tracers[material] = bvh.Tracer(self, seen=seen)
-        return self._mirror_tracers[material]
+        if material not in self.mirror_tracers:
+            self.mirror_tracers[material] = bvh.Tracer(self, seen=seen)
+        return self.mirror_tracers[material]
 
     def part_tracer(self, part: int):
         """The owner of the ray acceleration structure of one part alone (`bvh.Tracer`), built at first use."""
         from warp_reflect import bvh
 
-        if part not in self._part_tracers:
-            self._part_tracers[part] = bvh.Tracer(self, part)
-        return self._part_tracers[part]
+        if part not in self.part_tracers:
+            self.part_tracers[part] = bvh.Tracer(self, part)
+        return self.part_tracers[part]
 
     @cached_property
     def moving_parts(self) -> tuple[int, ...]:
@@ -538,11 +567,6 @@ class Scene:
             other.shadow_tracer = self._masked_tracer(casts & self._stands_still())
         return other
 
-    def keep_still_tracer(self, earlier: Scene) -> None:
-        """Take `still_tracer` over from the same stage's scene at another time, whose triangles have the same numbers."""
-        if self.moving_parts and "still_tracer" in vars(earlier):
-            self.still_tracer = earlier.still_tracer
-
     @cached_property
     def lights(self):
         """The lights as kernels read them (`shade.LightView`), prepared at first use."""
@@ -555,19 +579,48 @@ class Scene:
         """The textures as kernels look them up (`textures.TextureSet`), read at first use."""
         from warp_reflect import textures
 
-        return textures.prepare_textures(self, self._pyramids)
+        if self.known_textures is not None:
+            made, notes = self.known_textures
+            self.notes += [note for note in notes if note not in self.notes]
+        else:
+            count = len(self.notes)
+            made = textures.prepare_textures(self, self.pyramids)
+            self.known_textures = made, self.notes[count:]
+        return made
 
     def body(self, part: int) -> Body:
         """The triangles of a part classified as a solid, scene frame."""
-        if part not in self._bodies:
+        if part not in self.bodies:
             piece = self.parts[part]
-            first = piece.first_vertex
-            faces = self.host_triangles[piece.first_triangle : piece.first_triangle + piece.triangle_count]
-            body = analyse(self.host_points[first : first + piece.vertex_count], faces - first)
+            body = self._moving_body(part) if part in self.moving_parts else None
+            if body is None:
+                first = piece.first_vertex
+                faces = self.host_triangles[piece.first_triangle : piece.first_triangle + piece.triangle_count]
+                body = analyse(self.host_points[first : first + piece.vertex_count], faces - first)
             if self.has_hole is not None and self.has_hole[piece.first_triangle :][: piece.triangle_count].any():
                 body = replace(body, convex=False)  # through its holes it sees its own inside
-            self._bodies[part] = body
-        return self._bodies[part]
+            self.bodies[part] = body
+        return self.bodies[part]
+
+    def _moving_body(self, part: int) -> Body | None:
+        """The body of what moves: its mesh's, placed; None where it is placed by more than a similarity."""
+        prim = self.parts[part].prim
+        instance = self.data.instances[prim - 1]
+        mesh, scene_from_object = self.data.meshes[instance.mesh], self.scene_from_object(instance)
+        if not is_similarity(scene_from_object):
+            return None
+        key = instance.mesh, part - next(k for k, each in enumerate(self.parts) if each.prim == prim)
+        if key not in self.bodies_in_place:
+            own = (mesh.parts or [Part(0, len(mesh.triangles))])[key[1]]
+            faces = mesh.triangles[own.first_triangle : own.first_triangle + own.triangle_count]
+            self.bodies_in_place[key] = analyse(mesh.points, faces)
+        return self.bodies_in_place[key].placed(scene_from_object)
+
+    def scene_from_object(self, instance: InstanceData) -> np.ndarray:
+        """float64 [4, 4] of an instance."""
+        matrix = instance.world_from_object.copy()
+        matrix[:3, 3] -= self.origin
+        return matrix
 
     def _flatten(self) -> None:
         """Lay instances out one after the other in the scene frame."""
@@ -576,24 +629,19 @@ class Scene:
         triangle_patch, patches, self.parts, self.patch_shapes = [], [], [], []
         first_vertex = first_triangle = first_normal = first_color = 0
         any_color = any(mesh.colors is not None for mesh in data.meshes)
-        scene_from_world = np.eye(4)
-        scene_from_world[:3, 3] = -self.origin
         for prim, inst in enumerate(data.instances, 1):
             mesh = data.meshes[inst.mesh]
             count = len(mesh.triangles)
-            scene_from_object = scene_from_world @ inst.world_from_object
-            linear = scene_from_object[:3, :3]
-            flip = np.linalg.det(linear) < 0.0
+            scene_from_object = self.scene_from_object(inst)
+            flip = np.linalg.det(scene_from_object[:3, :3]) < 0.0
             order = [0, 2, 1] if flip else [0, 1, 2]
-            points.append((mesh.points.astype(np.float64) @ linear.T + scene_from_object[:3, 3]).astype(np.float32))
+            points.append(placed_points(mesh, scene_from_object))
             triangles.append(np.take(mesh.triangles, order, axis=1))
             triangles[-1] += np.int32(first_vertex)
             if mesh.normals is None:
                 normal_index.append(np.full((count, 3), -1, np.int32))
             else:
-                transformed = mesh.normals.astype(np.float64) @ np.linalg.inv(linear)
-                transformed /= np.maximum(np.linalg.norm(transformed, axis=1, keepdims=True), 1e-300)
-                normals.append(transformed.astype(np.float32))
+                normals.append(placed_normals(mesh, scene_from_object))
                 index = mesh.triangles if mesh.normal_index is None else mesh.normal_index
                 normal_index.append(np.take(index, order, axis=1))
                 normal_index[-1] += np.int32(first_normal)
@@ -607,14 +655,13 @@ class Scene:
                     color_index.append(np.take(index, order, axis=1))
                     color_index[-1] += np.int32(first_color)
                     first_color += len(mesh.colors)
-            object_from_scene = np.linalg.inv(scene_from_object)
             for k, part in enumerate(mesh.parts or [Part(0, count)]):
                 material = inst.materials[k]
                 first_patch = len(patches)
                 for patch in part.patches or (Patch(part.first_triangle, part.triangle_count),):
                     triangle_patch.append(np.full(patch.triangle_count, len(patches), np.int32))
                     patches.append(
-                        _patch_view(patch, first_triangle, len(self.parts), prim, material, mesh, object_from_scene)
+                        _patch_view(patch, first_triangle, len(self.parts), prim, material, mesh, scene_from_object)
                     )
                     self.patch_shapes.append(patch.shape)
                 self.parts.append(
@@ -661,7 +708,40 @@ def _stack(arrays: list, empty: tuple, dtype) -> np.ndarray:
     return (arrays[0] if len(arrays) == 1 else np.concatenate(arrays)).astype(dtype, copy=False)
 
 
-def _patch_view(patch, first_triangle, part, prim, material, mesh, object_from_scene) -> PatchView:
+def placed_points(mesh: MeshData, scene_from_object: np.ndarray) -> np.ndarray:
+    """A mesh's points in the scene frame, float32."""
+    return (mesh.points.astype(np.float64) @ scene_from_object[:3, :3].T + scene_from_object[:3, 3]).astype(np.float32)
+
+
+def placed_normals(mesh: MeshData, scene_from_object: np.ndarray) -> np.ndarray:
+    """A mesh's normals in the scene frame, float32, of unit length."""
+    normals = mesh.normals.astype(np.float64) @ np.linalg.inv(scene_from_object[:3, :3])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    return normals.astype(np.float32)
+
+
+def first_rows(data: SceneData) -> tuple[np.ndarray, np.ndarray]:
+    """Per instance its first row in a scene's points and in its normals, int [instance_count]."""
+    meshes = [data.meshes[instance.mesh] for instance in data.instances]
+    points = np.array([len(mesh.points) for mesh in meshes], int)
+    normals = np.array([0 if mesh.normals is None else len(mesh.normals) for mesh in meshes], int)
+    return np.cumsum(points) - points, np.cumsum(normals) - normals
+
+
+def box_corners(points: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """Corners of the boxes of ranges of points, each from its first to the next one's, float64 [n, 8, 3]."""
+    low = np.minimum.reduceat(points, first, axis=0).astype(np.float64)
+    high = np.maximum.reduceat(points, first, axis=0).astype(np.float64)
+    bits = (np.arange(8)[:, None] >> np.arange(3)) & 1
+    return np.where(bits[None] == 1, high[:, None], low[:, None])
+
+
+def unit_from_scene(shape: Shape, scene_from_object: np.ndarray) -> np.ndarray:
+    """float32 [4, 4] of an analytic surface."""
+    return (shape.unit_from_object @ np.linalg.inv(scene_from_object)).astype(np.float32)
+
+
+def _patch_view(patch, first_triangle, part, prim, material, mesh, scene_from_object) -> PatchView:
     view = PatchView()
     view.first_triangle = first_triangle + patch.first_triangle
     view.triangle_count = patch.triangle_count
@@ -673,8 +753,7 @@ def _patch_view(patch, first_triangle, part, prim, material, mesh, object_from_s
     if patch.shape is not None:
         view.shape = int(SHAPE_QUADRIC if patch.shape.kind == "quadric" else SHAPE_PLANE)
         view.quadric = wp.vec3(patch.shape.a, patch.shape.b, patch.shape.c)
-        unit_from_scene = patch.shape.unit_from_object @ object_from_scene
-        view.unit_from_scene = wp.mat44(unit_from_scene.astype(np.float32))
+        view.unit_from_scene = wp.mat44(unit_from_scene(patch.shape, scene_from_object))
     return view
 
 
@@ -713,75 +792,18 @@ def material_view(material: MaterialData) -> MaterialView:
 
 
 def _scene_origin(data: SceneData) -> np.ndarray:
-    """Middle of the instances' positions (a median, which one stray prim cannot drag away)."""
+    """Middle of the instances' positions (a median, which one stray prim cannot drag away).
+
+    Of those that do not move, where there are any: the frame of a scene is then the same at every time of its stage.
+    """
     if not data.instances:
         return np.zeros(3)
     centres = []
-    for inst in data.instances:
-        points = data.meshes[inst.mesh].points
-        middle = 0.5 * (points.min(axis=0) + points.max(axis=0)).astype(np.float64) if len(points) else np.zeros(3)
-        centres.append(inst.world_from_object[:3, :3] @ middle + inst.world_from_object[:3, 3])
+    middles = [_middle(mesh.points) for mesh in data.meshes]
+    for inst in [each for each in data.instances if not each.moves] or data.instances:
+        centres.append(inst.world_from_object[:3, :3] @ middles[inst.mesh] + inst.world_from_object[:3, 3])
     return np.median(np.asarray(centres), axis=0)
 
 
-def same_world(a: SceneData, b: SceneData) -> bool:
-    """Whether two readings hold the same geometry, materials and lights; times, cameras and notes may differ."""
-    return (
-        len(a.meshes) == len(b.meshes)
-        and len(a.instances) == len(b.instances)
-        and a.materials == b.materials
-        and all(_same(x, y) for x, y in zip(a.instances, b.instances, strict=True))
-        and all(_same(x, y) for x, y in zip(a.meshes, b.meshes, strict=True))
-        and _same(a.lights, b.lights)
-        and _same(a.pictures, b.pictures)
-    )
-
-
-def same_lights(a: Scene, b: Scene) -> bool:
-    """Whether two scenes are lit alike."""
-    return _same(a.data.lights, b.data.lights)
-
-
-def _same(a, b) -> bool:
-    """Equality of what a `SceneData` holds: arrays by their numbers."""
-    if a is b:
-        return True
-    if isinstance(a, np.ndarray):
-        return isinstance(b, np.ndarray) and a.shape == b.shape and a.dtype == b.dtype and bool((a == b).all())
-    if type(a) is not type(b):
-        return False
-    if isinstance(a, dict):
-        return a.keys() == b.keys() and all(_same(a[key], b[key]) for key in a)
-    if isinstance(a, list | tuple):
-        return len(a) == len(b) and all(_same(x, y) for x, y in zip(a, b, strict=True))
-    if is_dataclass(a):
-        return all(_same(getattr(a, each.name), getattr(b, each.name)) for each in fields(a))
-    return a == b
-
-
-def edge_neighbours(triangles: np.ndarray) -> np.ndarray:
-    """Per triangle the triangle across each edge (v0v1, v1v2, v2v0); -1 at borders and where more than two meet.
-
-    Args:
-        triangles: Vertex indices, int [triangle_count, 3].
-
-    Returns:
-        int32 [triangle_count, 3].
-    """
-    count = len(triangles)
-    result = np.full(3 * count, -1, np.int32)
-    if count:
-        starts = triangles.reshape(-1).astype(np.int64)
-        ends = triangles[:, [1, 2, 0]].reshape(-1).astype(np.int64)
-        key = np.minimum(starts, ends) * (int(triangles.max()) + 1) + np.maximum(starts, ends)
-        order = np.argsort(key, kind="stable")
-        ordered = key[order]
-        same = ordered[1:] == ordered[:-1]
-        # Exactly two uses of an edge: equal to the next one, and to no other on either side.
-        pair = same.copy()
-        pair[1:] &= ~same[:-1]
-        pair[:-1] &= ~same[1:]
-        left, right = order[:-1][pair], order[1:][pair]
-        result[left] = right // 3
-        result[right] = left // 3
-    return result.reshape(count, 3)
+def _middle(points: np.ndarray) -> np.ndarray:
+    return 0.5 * (points.min(axis=0) + points.max(axis=0)).astype(np.float64) if len(points) else np.zeros(3)

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from warp_reflect.bodies import Sheet, fit_sheet, overhang, weld
-from warp_reflect.scene import PartRange, Scene, edge_neighbours
+from warp_reflect.scene import PartRange, Scene
+from warp_reflect.topology import edge_neighbours
 
 EDGE_SINE_MAX = 0.3  # 17 degrees; facets of a coarse but smooth body stay below, the rim of a cylinder is far above
 CREASE_COS = 0.85  # 32 degrees: facets that turn by more do not share a vertex normal

@@ -51,7 +51,7 @@ def load_stage(
     def at(code: float | None, known: Scene | None = None) -> Scene:
         data = _without_map_files(read_untrusted(path, code, *arguments[1:])) if reader is None else reader.read(code)
         seen = known.seen_at(data) if known is not None else None
-        return Scene(data, device, reload=at) if seen is None else seen
+        return Scene(data, device, reload=at, earlier=known) if seen is None else seen
 
     return at(time)
 

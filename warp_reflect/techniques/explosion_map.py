@@ -24,11 +24,12 @@ from warp_reflect.launch import launch
 from warp_reflect.layers import Camera, CameraView, GBuffer, MirrorPixels, ReflectionLayer, Reflector, project
 from warp_reflect.optics import mirror_point, specular_residual
 from warp_reflect.raster import make_target, rasterise, resolve_kernel
-from warp_reflect.scene import PartRange, Scene, edge_neighbours
+from warp_reflect.scene import PartRange, Scene
 from warp_reflect.segments import part_mesh
 from warp_reflect.settings import Settings, Status, Technique
 from warp_reflect.techniques import forward
 from warp_reflect.techniques.vertices import SolveFrame, VertexView, edge_reach
+from warp_reflect.topology import edge_neighbours
 
 wp.set_module_options({"enable_backward": False})
 

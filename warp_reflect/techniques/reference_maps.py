@@ -16,7 +16,8 @@ import numpy as np
 from warp_reflect import baked_environments, bvh
 from warp_reflect.environment_maps import CubeMaps, pack_maps, render_maps, stored_maps
 from warp_reflect.reflectors import mirror_weight
-from warp_reflect.scene import Note, Scene, same_lights
+from warp_reflect.scene import Note, Scene
+from warp_reflect.scene_times import same_lights
 from warp_reflect.settings import Settings
 from warp_reflect.shadows import asked_shadows
 from warp_reflect.techniques.environment import centre_of
@@ -128,9 +129,9 @@ def take_over(earlier: Scene, scene: Scene) -> None:
     """Hand reference maps, and the structure for rays, to the same stage's scene at another time: nothing in them moves."""
     if earlier is scene or not same_lights(earlier, scene) or _still_prims(earlier) != _still_prims(scene):
         return
-    if same_numbers(earlier, scene):
-        scene.keep_still_tracer(earlier)
     for key, known in earlier.environments.items():
+        if key[0] == PLACES_KEY and key not in scene.environments and _same_places(earlier, scene):
+            scene.environments[key] = known
         if key[0] == KEY and key not in scene.environments:
             maps = known.maps.at(scene)
             scene.environments[key] = ReferenceMaps(maps, known.placement, known.notes, known.reach)
@@ -408,6 +409,11 @@ def same_numbers(earlier: Scene, scene: Scene) -> bool:
     """Whether triangles of two scenes of a stage that have the same number are the same ones, at other times."""
     one, other = ([(part.first_triangle, part.triangle_count) for part in each.parts] for each in (earlier, scene))
     return one == other
+
+
+def _same_places(earlier: Scene, scene: Scene) -> bool:
+    one, other = (authored(each) for each in (earlier, scene))
+    return one.paths == other.paths and np.array_equal(one.centres, other.centres)
 
 
 def _still_prims(scene: Scene) -> list[tuple]:

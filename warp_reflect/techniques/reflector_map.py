@@ -161,10 +161,11 @@ def scene_segments(scene: Scene, part: int) -> Segmentation:
 
 
 def _one_map(scene: Scene, part: int) -> bool:
-    known = scene.facts.get(("one map", part))
+    key = "one map", scene.parts[part].first_triangle
+    known = scene.facts.get(key)
     if known is None:
         known = scene.body(part).convex and _sharpest(*part_mesh(scene, scene.parts[part])) <= EDGE_SINE_MAX
-        scene.facts["one map", part] = known
+        scene.facts[key] = known
     return known
 
 
