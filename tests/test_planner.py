@@ -44,7 +44,7 @@ def test_tiny_mirror_gets_the_cheapest_without_a_look_at_its_shape(ball_room):
     scene = Scene(ball_room.data, str(ball_room.device))
     row = planned(scene, few_pixels=pixels + 1)
     assert row.technique == "raytraced" and f"few_pixels={pixels + 1}" in row.reason and str(pixels) in row.reason
-    assert not scene._bodies, "its shape was looked at"
+    assert not scene.bodies, "its shape was looked at"
     assert "few_pixels" not in planned(ball_room, few_pixels=pixels).reason
 
 
