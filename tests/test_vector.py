@@ -5,15 +5,16 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import trimesh
 import warp as wp
 from rooms import CHROME, placed, plane_room, room, sphere, square
 
 import warp_reflect as wr
-from warp_reflect import raster, surface, vector
+from warp_reflect import raster, reflector_maps, surface, vector
 from warp_reflect.layers import Camera, CameraView
 from warp_reflect.raster import make_target, rasterise
 from warp_reflect.scene import CameraData, InstanceData, LightData, MaterialData, Scene, SceneData
-from warp_reflect.techniques import quadric_patch, refine
+from warp_reflect.techniques import map_search, quadric_patch, refine, reflector_map
 from warp_reflect.techniques.quadric_search import QuadricView
 from warp_reflect.techniques.vertices import SolveFrame, empty_vertices
 
@@ -254,11 +255,8 @@ BODIES = {
 }
 
 
-def searched(body, points, eye, kernels, threads=1, seeds=None):
-    """VertexView of points in the unit frame, as `quadric_patch.reflect` has them solved."""
-    lam, b, c, family = body
-    quadric = QuadricView()
-    quadric.lam, quadric.b, quadric.c, quadric.family = wp.vec3(*lam), b, c, family
+def looking_at_origin(eye):
+    """(SolveFrame, CameraView) of a unit frame that is the scene's."""
     frame = SolveFrame()
     frame.unit_from_scene = frame.eye_from_unit = wp.mat33(np.eye(3, dtype=np.float32))
     frame.eye = wp.vec3(*eye)
@@ -266,6 +264,15 @@ def searched(body, points, eye, kernels, threads=1, seeds=None):
     forward = -np.float64(eye) / np.linalg.norm(eye)
     camera.forward, camera.near, camera.far = wp.vec3(*forward), 1e-3, 1e3
     camera.x_row, camera.y_row = wp.vec4(300.0, 0.0, 20.0, 0.0), wp.vec4(0.0, 280.0, -30.0, 0.0)
+    return frame, camera
+
+
+def searched(body, points, eye, kernels, threads=1, seeds=None):
+    """VertexView of points in the unit frame, as `quadric_patch.reflect` has them solved."""
+    lam, b, c, family = body
+    quadric = QuadricView()
+    quadric.lam, quadric.b, quadric.c, quadric.family = wp.vec3(*lam), b, c, family
+    frame, camera = looking_at_origin(eye)
     out = empty_vertices(len(points), CPU, with_position=True)
     if seeds is not None:
         out.seed.assign(seeds)
@@ -303,6 +310,56 @@ def test_reflection_points_are_searched_as_the_plain_kernel_does(name):
             # Sums are taken in the plain kernel's order.
             np.testing.assert_array_equal(vectors[field], plain[field], err_msg=field)
         for field, values in searched(body, points, eye, "vector", threads=2, seeds=start).items():
+            np.testing.assert_array_equal(values, vectors[field], err_msg=field)
+
+
+@pytest.fixture(scope="module")
+def bodies_of_maps():
+    """(map, whether it has a closing part) of an ellipsoid, a needle, a box with round edges and half an ellipsoid."""
+    turned = trimesh.creation.icosphere(3)
+    directions, faces = np.asarray(turned.vertices), np.asarray(turned.faces)
+    power = np.abs(directions) ** 6
+    shapes = {
+        "ellipsoid": directions * (1.0, 0.7, 0.5),
+        "needle": directions * (1.0, 0.06, 0.05),
+    }
+    maps = {name: reflector_maps.ReflectorMap.from_mesh(points, faces, 48) for name, points in shapes.items()}
+    box = trimesh.convex.convex_hull(directions / power.sum(axis=1, keepdims=True) ** (1.0 / 6.0))
+    maps["rounded box"] = reflector_maps.ReflectorMap.from_mesh(box.vertices, box.faces, 48)
+    front = faces[(shapes["ellipsoid"][faces][..., 2] > 0.0).all(axis=1)]
+    maps["half"] = reflector_maps.ReflectorMap.from_mesh(shapes["ellipsoid"], front, 48)
+    return maps
+
+
+def searched_in_map(drawn_map, points, eye, kernels, threads=1, seeds=None, **knobs):
+    """VertexView of points in a map's unit frame, as `reflector_map.reflect` has them solved."""
+    frame, camera = looking_at_origin(eye)
+    out = empty_vertices(len(points), CPU, with_position=True)
+    if seeds is not None:
+        out.seed.assign(seeds)
+    array = wp.array(points, dtype=wp.vec3, device=CPU)
+    chosen = map_search.search_settings(wr.Settings(**knobs), drawn_map.resolution)
+    where = CPU, threads, kernels
+    reflector_map.search(array, [3, 2], drawn_map, frame, camera, chosen, seeds is not None, out, *where)
+    return {name: getattr(out, name).numpy() for name in ("status", "screen", "seed", "residual", "reach", "position")}
+
+
+@pytest.mark.parametrize("name", ["ellipsoid", "needle", "rounded box", "half"])
+def test_maps_are_searched_as_the_plain_kernel_does(bodies_of_maps, name):
+    drawn_map, eye = bodies_of_maps[name], (2.5, 1.2, 1.7)
+    points = hard_points(None, eye)
+    cold = searched_in_map(drawn_map, points, eye, "plain")
+    assert {1, 3} <= set(cold["status"].tolist()) and (cold["status"] == 1).sum() > 200
+    # Seeds that are right, far off, and missing; a search of few steps, which leaves much to the plain kernel.
+    seeds = cold["seed"] * np.random.default_rng(2).choice([0.0, 1.0, 1.0, -1.0], (len(points), 1)).astype(np.float32)
+    for start, knobs in ((None, {}), (seeds, {}), (None, {"iterations": 2}), (None, {"tolerance": 1.0e-3})):
+        plain = searched_in_map(drawn_map, points, eye, "plain", seeds=start, **knobs)
+        vectors = searched_in_map(drawn_map, points, eye, "vector", seeds=start, **knobs)
+        np.testing.assert_array_equal(vectors["status"], plain["status"])
+        for field in ("screen", "seed", "residual", "reach", "position"):
+            # Sums are taken in the plain kernel's order.
+            np.testing.assert_array_equal(vectors[field], plain[field], err_msg=field)
+        for field, values in searched_in_map(drawn_map, points, eye, "vector", 2, start, **knobs).items():
             np.testing.assert_array_equal(values, vectors[field], err_msg=field)
 
 

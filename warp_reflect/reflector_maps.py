@@ -43,7 +43,11 @@ class ReflectorMapView:
 
 @wp.struct
 class MapSample:
-    """Surface at a cube point, with derivatives by the face coordinates."""
+    """Surface at a cube point, with derivatives per texel along the face's axes.
+
+    Those of the normal are of the interpolated one over its length: they have a part along the normal, which every
+    tangent leaves out.
+    """
 
     p: wp.vec3
     p_u: wp.vec3
@@ -113,17 +117,15 @@ def sample_map(map: ReflectorMapView, x: wp.vec3) -> MapSample:
     n_low = n00 + a * (n01 - n00)
     n_high = n10 + a * (n11 - n10)
     s = MapSample()
-    s.p = p_low + b * (p_high - p_low)
-    s.p_v = scale * (p_high - p_low)
-    s.p_u = scale * ((1.0 - b) * (p01 - p00) + b * (p11 - p10))
-    raw = n_low + b * (n_high - n_low)
+    s.p_v = p_high - p_low
+    s.p_u = (1.0 - b) * (p01 - p00) + b * (p11 - p10)
+    s.p = p_low + b * s.p_v
+    raw_v = n_high - n_low
+    raw = n_low + b * raw_v
     inv = 1.0 / wp.max(wp.length(raw), 1.0e-20)
-    n = raw * inv
-    n_v = scale * inv * (n_high - n_low)
-    n_u = scale * inv * ((1.0 - b) * (n01 - n00) + b * (n11 - n10))
-    s.n = n
-    s.n_u = n_u - wp.dot(n_u, n) * n
-    s.n_v = n_v - wp.dot(n_v, n) * n
+    s.n = inv * raw
+    s.n_v = inv * raw_v
+    s.n_u = inv * ((1.0 - b) * (n01 - n00) + b * (n11 - n10))
     return s
 
 

@@ -170,9 +170,15 @@ _HEAD = r"""
 """
 
 
-def snippet(body: str, elsewhere: str = "") -> str:
-    """The text of a native function: `body` after the shared head on a CPU, `elsewhere` for CUDA (never launched there)."""
-    return f"#if !defined(__CUDACC_RTC__) && !defined(__CUDA_ARCH__)\n{_HEAD}{body}\n#else\n{elsewhere}\n#endif\n"
+def snippet(body: str, elsewhere: str = "", wide: bool = False) -> str:
+    """The text of a native function: `body` after the shared head on a CPU, `elsewhere` for CUDA (never launched there).
+
+    Args:
+        wide: 16 lanes whatever the processor has: two vectors of eight go side by side where every operation waits for the
+            one before it.
+    """
+    head = _HEAD.replace("#if defined(__AVX512F__)", "#if 1") if wide else _HEAD
+    return f"#if !defined(__CUDACC_RTC__) && !defined(__CUDA_ARCH__)\n{head}{body}\n#else\n{elsewhere}\n#endif\n"
 
 
 def block_count(count: int) -> int:

@@ -114,8 +114,11 @@ def measure(s: MapSample, x: wp.vec3, eye: wp.vec3, target: wp.vec3) -> SearchRe
     r.x = x
     r.p = s.p
     r.n = s.n
-    o = wp.normalize(eye - s.p)
-    v = wp.normalize(target - s.p)
+    to_eye = eye - s.p
+    to_target = target - s.p
+    # The reciprocals are those of `newton_step`, which the compiler shares.
+    o = to_eye * (1.0 / wp.max(wp.length(to_eye), 1.0e-20))
+    v = to_target * (1.0 / wp.max(wp.length(to_target), 1.0e-20))
     w = o + v
     r.cos_eye = wp.dot(s.n, o)
     r.cos_target = wp.dot(s.n, v)
@@ -182,10 +185,11 @@ def newton_step(s: MapSample, eye: wp.vec3, target: wp.vec3) -> wp.vec3:
     h12 = -o1 * o2 * inv_o - v1 * v2 * inv_v + k * s12
     g1 = o1 + v1
     g2 = o2 + v2
-    det_h = h11 * h22 - h12 * h12
-    d1 = float(0.0)
-    d2 = float(0.0)
-    safe = bool(True)
+    det = h11 * h22 - h12 * h12
+    m11 = h11
+    m12 = h12
+    m21 = h12
+    m22 = h22
     if w_n > NORMAL_PART_MIN:
         q1 = s11 * g1 + s12 * g2 + n_o * o1 * inv_o + n_v * v1 * inv_v
         q2 = s12 * g1 + s22 * g2 + n_o * o2 * inv_o + n_v * v2 * inv_v
@@ -194,14 +198,18 @@ def newton_step(s: MapSample, eye: wp.vec3, target: wp.vec3) -> wp.vec3:
         j12 = h12 + g1 * q2 * inv_w
         j21 = h12 + g2 * q1 * inv_w
         j22 = h22 + g2 * q2 * inv_w
-        det = j11 * j22 - j12 * j21
-        if det > SPD_SHARE * det_h and det > 0.0:
-            d1 = (j22 * g1 - j12 * g2) / det
-            d2 = (j11 * g2 - j21 * g1) / det
-            safe = False
-    if safe and det_h > 0.0:
-        d1 = (h22 * g1 - h12 * g2) / det_h
-        d2 = (h11 * g2 - h12 * g1) / det_h
+        det_j = j11 * j22 - j12 * j21
+        if det_j > SPD_SHARE * det and det_j > 0.0:
+            det = det_j
+            m11 = j11
+            m12 = j12
+            m21 = j21
+            m22 = j22
+    inv = float(0.0)
+    if det > 0.0:
+        inv = 1.0 / det
+    d1 = (m22 * g1 - m12 * g2) * inv
+    d2 = (m11 * g2 - m21 * g1) * inv
     return d1 * t1 + d2 * t2
 
 

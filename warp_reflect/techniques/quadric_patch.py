@@ -69,7 +69,10 @@ def search(
     inputs = [points, *own, quadric, frame, camera, int(warm), out_vertex]
     cone = quadric.family == int(Family.SHEET) and quadric.c == 0.0
     if not cone and vector.chosen(kernels, device):
-        vector.launch_blocks(quadric_vector.search_blocks_kernel, len(points), inputs, device, threads)
+        left = wp.zeros(vector.block_count(len(points)), dtype=wp.uint8, device=device)
+        vector.launch_blocks(quadric_vector.search_blocks_kernel, len(points), [*inputs, left], device, threads)
+        if not left.numpy().any():
+            return
     launch(search_kernel, len(points), inputs, device, threads)
 
 

@@ -12,6 +12,7 @@ import warp as wp
 from warp_reflect import vector
 from warp_reflect.layers import CameraView
 from warp_reflect.optics import MIN_DET_SHARE, MIN_HALF_NORMAL
+from warp_reflect.techniques.lanes import VIRTUAL_VERTEX
 from warp_reflect.techniques.quadric_search import (
     ACCEPTED,
     APEX_NEAR,
@@ -29,22 +30,14 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.func_native(
-    vector.snippet(r"""
+    vector.snippet(
+        VIRTUAL_VERTEX
+        + r"""
     const int count = points.shape[0];
     const int begin = block * BLOCK;
     const int end = begin + BLOCK < count ? begin + BLOCK : count;
     const float l0 = quadric.lam[0], l1 = quadric.lam[1], l2 = quadric.lam[2], b = quadric.b, c = quadric.c;
     const int family = quadric.family;
-    const V eye = spread(frame.eye);
-    auto root = [](F a) -> F { return __builtin_elementwise_sqrt(a); };
-    auto magnitude = [](F a) -> F { return __builtin_elementwise_abs(a); };
-    auto length = [&](V a) -> F { return root(dot(a, a)); };
-    auto over = [](V a, F s) -> V { return V{a.x / s, a.y / s, a.z / s}; };
-    auto matrix = [&](const auto& m, V a) -> V {
-        return V{m.data[0][0] * a.x + m.data[0][1] * a.y + m.data[0][2] * a.z,
-            m.data[1][0] * a.x + m.data[1][1] * a.y + m.data[1][2] * a.z,
-            m.data[2][0] * a.x + m.data[2][1] * a.y + m.data[2][2] * a.z};
-    };
     auto value = [&](V x) -> F { return l0 * x.x * x.x + l1 * x.y * x.y + l2 * x.z * x.z + (b + b) * x.z + c; };
     auto gradient = [&](V x) -> V { return V{l0 * x.x, l1 * x.y, l2 * x.z + b}; };
     auto curve = [&](V u, V v) -> F { return l0 * u.x * v.x + l1 * u.y * v.y + l2 * u.z * v.z; };
@@ -79,34 +72,6 @@ wp.set_module_options({"enable_backward": False})
         }
         return put_on_surface(r);
     };
-    // optics.safe_normalize
-    auto safe = [&](V a, F& big) -> I {
-        big = size(a);
-        const F total = 0.25f * magnitude(a.x) + 0.25f * magnitude(a.y) + 0.25f * magnitude(a.z);
-        return (big > 0.0f) & (total - total == 0.0f);
-    };
-    auto safe_normalize = [&](V a) -> V {
-        F big;
-        const I fine = safe(a, big);
-        const V s = over(a, big);
-        return vpick(fine, over(s, length(s)), same(0.0f));
-    };
-    auto safe_length = [&](V a) -> F {
-        F big;
-        const I fine = safe(a, big);
-        return pick(fine, big * length(over(a, big)), F(0.0f));
-    };
-    auto tangents = [&](V n, V& t1, V& t2) {
-        const F sign = pick(n.z < 0.0f, F(-1.0f), F(1.0f));
-        const F a = -1.0f / (sign + n.z);
-        const F both = n.x * n.y * a;
-        t1 = V{1.0f + sign * n.x * n.x * a, sign * both, -sign * n.x};
-        t2 = V{both, sign + n.y * n.y * a, -n.y};
-    };
-    unsigned char* status = (unsigned char*)out_vertex.status.data;
-    float* screen = (float*)out_vertex.screen.data;
-    float* seeds = (float*)out_vertex.seed.data;
-    float* positions = (float*)out_vertex.position.data;
     const V at_eye = gradient(eye);
     const F eye_square = dot(eye, eye);
 
@@ -123,6 +88,7 @@ wp.set_module_options({"enable_backward": False})
         {
             const F n = length(at_target);
             const I touching = on_sheet(target) & (magnitude(value(target)) <= 2.0f * touches * (1.0f + length(target)) * n);
+            if (bits(asked & touching)) out_left.data[block] = 1;
             asked &= ~touching;
         }
         // quadric_search.is_visible
@@ -150,7 +116,10 @@ wp.set_module_options({"enable_backward": False})
             has = dot(seed, seed) > 0.0f;
             p = put_on_surface(seed);
         }
-        if (family != 0) asked &= has;
+        if (family != 0) {
+            if (bits(asked & ~has)) out_left.data[block] = 1;
+            asked &= has;
+        }
         if (!bits(asked)) continue;
         if (bits(asked & ~has)) {
             // quadrics.first_guess
@@ -220,6 +189,7 @@ wp.set_module_options({"enable_backward": False})
         V n = gradient(best);
         const F n_length = length(n);
         const I done = asked & (best_angle <= accepted) & (n_length >= apex_near);
+        if (bits(asked & ~done)) out_left.data[block] = 1;
         n = over(n, n_length);
         V t1, t2;
         tangents(n, t1, t2);
@@ -227,49 +197,10 @@ wp.set_module_options({"enable_backward": False})
         const F mean = 0.5f * (s11 + s22);
         const F apart = root(0.25f * (s11 - s22) * (s11 - s22) + s12 * s12);
         const F least_curvature = fmax(mean - apart, F(0.0f)) / n_length;
-        // vertices.edge_reach
-        const V to_eye = sub(eye, best), to_target = sub(target, best);
-        const F d_o = length(to_eye), d_v = length(to_target);
-        const F per_o = 1.0f / fmax(d_o, F(1.0e-20f));
-        const F cosine = magnitude(dot(n, to_eye)) / fmax(d_o, F(1.0e-20f));
-        const F least = cosine * cosine * (per_o + 1.0f / fmax(d_v, F(1.0e-20f))) + 2.0f * cosine * least_curvature;
-        const F reach = d_v * root(estimate * d_o * least);
-        // vertices.virtual_vertex
-        const F curvature = 1.0f / fmax(length(best), F(1.0e-6f));
-        const F a_length = safe_length(to_eye), b_length = safe_length(to_target);
-        const F c_a = magnitude(dot(to_eye, n));
-        const F behind = dot(to_target, n);
-        const V mirrored = sub(target, times(behind + behind, n));
-        const V prolonged = add(best, times(b_length, safe_normalize(sub(best, eye))));
-        const V image = matrix(frame.eye_from_unit,
-            sub(vpick((c_a + c_a) * curvature * b_length < a_length + b_length, mirrored, prolonged), eye));
-        // layers.project
-        const F depth = dot(spread(camera.forward), image);
-        F x = camera.x_row[0] * image.x + camera.x_row[1] * image.y + camera.x_row[2] * image.z + camera.x_row[3];
-        F y = camera.y_row[0] * image.x + camera.y_row[1] * image.y + camera.y_row[2] * image.z + camera.y_row[3];
-        const I before = depth < camera.near;
-        F key;
-        if (camera.orthographic != 0) {
-            key = pick(before, F(0.0f), 1.0f - depth / camera.far);
-        } else {
-            const F inv = 1.0f / depth;
-            key = pick(before, F(0.0f), inv);
-            x = pick(before, x, x * inv);
-            y = pick(before, y, y * inv);
-        }
-        for (unsigned left = bits(done); left != 0; left &= left - 1) {
-            const int l = __builtin_ctz(left), i = start + l;
-            status[i] = (unsigned char)converged;
-            out_vertex.residual.data[i] = best_angle[l];
-            out_vertex.reach.data[i] = reach[l];
-            seeds[3 * i] = best.x[l]; seeds[3 * i + 1] = best.y[l]; seeds[3 * i + 2] = best.z[l];
-            screen[4 * i] = x[l]; screen[4 * i + 1] = y[l]; screen[4 * i + 2] = key[l]; screen[4 * i + 3] = depth[l];
-            if (out_vertex.position.shape[0] > 0) {
-                positions[3 * i] = image.x[l]; positions[3 * i + 1] = image.y[l]; positions[3 * i + 2] = image.z[l];
-            }
-        }
+        settle(done, own, best, best_angle, virtual_vertex(best, n, target), edge_reach(best, n, target, least_curvature));
     }
-""")
+"""
+    )
 )
 def search_block(
     block: int,
@@ -292,6 +223,7 @@ def search_block(
     converged: int,
     hidden: int,
     out_vertex: VertexView,
+    out_left: wp.array(dtype=wp.uint8),
 ): ...
 
 
@@ -307,8 +239,9 @@ def search_blocks_kernel(
     frame: SolveFrame,
     camera: CameraView,
     warm: int,
-    # Outputs (seed: in and out, zero where none):
+    # Outputs (seed: in and out, zero where none; per block, whether something is left for the plain kernel):
     out_vertex: VertexView,
+    out_left: wp.array(dtype=wp.uint8),
 ):
     """One thread per block of vertices; as `quadric_patch.search_kernel`."""
     search_block(
@@ -332,4 +265,5 @@ def search_blocks_kernel(
         CONVERGED,
         HIDDEN,
         out_vertex,
+        out_left,
     )

@@ -16,6 +16,7 @@ from functools import partial
 import numpy as np
 import warp as wp
 
+from warp_reflect import vector
 from warp_reflect.bodies import weld
 from warp_reflect.launch import launch
 from warp_reflect.layers import Camera, CameraView, GBuffer, MirrorPixels, ReflectionLayer, Reflector
@@ -23,8 +24,14 @@ from warp_reflect.reflector_maps import ReflectorMap, ReflectorMapView
 from warp_reflect.scene import PartRange, Scene
 from warp_reflect.segments import EDGE_SINE_MAX, Segmentation, part_mesh, segment
 from warp_reflect.settings import Settings, Technique
-from warp_reflect.techniques import baking, forward, grid, pieces, planar, sheet_branches
-from warp_reflect.techniques.map_search import SearchSettings, is_visible, search_settings, solve_vertex
+from warp_reflect.techniques import baking, forward, grid, map_vector, pieces, planar, sheet_branches
+from warp_reflect.techniques.map_search import (
+    SEARCH_MIDPOINT,
+    SearchSettings,
+    is_visible,
+    search_settings,
+    solve_vertex,
+)
 from warp_reflect.techniques.pieces import Piece
 from warp_reflect.techniques.vertices import SolveFrame, VertexView, vertices_from
 
@@ -59,6 +66,38 @@ def search_kernel(
     if warm != 0:
         seed = out_vertex.seed[i]
     solve_vertex(map, frame, camera, settings, target, seed, i, out_vertex)
+
+
+def search(
+    points: wp.array,
+    own: list[int],
+    map: ReflectorMap,
+    frame: SolveFrame,
+    camera: CameraView,
+    chosen: SearchSettings,
+    warm: bool,
+    out_vertex: VertexView,
+    device,
+    threads: int,
+    kernels: str,
+) -> None:
+    """Solve every vertex that has no status yet.
+
+    Args:
+        points: vec3 [n], scene frame.
+        own: [first, count] of the vertices that have no picture.
+        chosen: From `map_search.search_settings`.
+        warm: Start from `out_vertex.seed` where it is not zero.
+        kernels: `Settings.kernels`.
+    """
+    count = len(points)
+    inputs = [points, *own, map.view, frame, camera, chosen, int(warm), out_vertex]
+    if chosen.method != int(SEARCH_MIDPOINT) and vector.chosen(kernels, device):
+        left = wp.zeros(vector.block_count(count), dtype=wp.uint8, device=device)
+        vector.launch_blocks(map_vector.search_blocks_kernel, count, [*inputs, left], device, threads)
+        if not left.numpy().any():
+            return
+    launch(search_kernel, count, inputs, device, threads)
 
 
 @wp.kernel
@@ -349,19 +388,19 @@ def reflect(
         chosen.iterations = SHEET_EVALUATIONS
     statistics, used = {}, []
 
-    def search(points, own: list[int], frame: SolveFrame, warm: bool, out_vertex: VertexView) -> None:
-        inputs = [points, *own, prepared.map.view, frame, gbuffer.view, chosen, int(warm), out_vertex]
-        launch(search_kernel, len(points), inputs, scene.device, settings.threads)
+    def solve(points, own: list[int], frame: SolveFrame, warm: bool, out_vertex: VertexView) -> None:
+        run_on = scene.device, settings.threads, settings.kernels
+        search(points, own, prepared.map, frame, gbuffer.view, chosen, warm, out_vertex, *run_on)
 
     def solve_vertices(points, has_own: bool, frame: SolveFrame, warm: bool, out_vertex: VertexView) -> None:
         own = forward.own_vertices(part) if has_own else [0, 0]
         if prepared.grid is None or not has_own:
-            search(points, own, frame, warm, out_vertex)
+            solve(points, own, frame, warm, out_vertex)
             return
         counts, cells = grid.fill(
             scene,
             prepared.grid,
-            lambda asked, out: search(asked, [0, 0], frame, True, out),
+            lambda asked, out: solve(asked, [0, 0], frame, True, out),
             frame,
             prepared.map,
             gbuffer.view,
@@ -375,7 +414,7 @@ def reflect(
         if len(points) > scene.vertex_count:
             # Vertices of triangles that the previous frame cut.
             added = vertices_from(out_vertex, scene.vertex_count)
-            search(points[scene.vertex_count :], [0, 0], frame, warm, added)
+            solve(points[scene.vertex_count :], [0, 0], frame, warm, added)
 
     def solve_boundary(points, frame: SolveFrame, edges: wp.array, out_point: wp.array) -> None:
         launch(

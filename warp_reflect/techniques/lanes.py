@@ -1,0 +1,216 @@
+"""Text that the vector searches share: what comes after a reflection point is found, and how a reflector map is read.
+
+Each piece is the device function named above it for a vector of elements, with the same operations in the same order. They
+follow the head of `vector.snippet` and name the arguments `frame`, `camera` and, of a map, `map` of the function around them.
+"""
+
+from __future__ import annotations
+
+# What every search ends with: `vertices.edge_reach`, `vertices.virtual_vertex`, `layers.project`.
+VIRTUAL_VERTEX = r"""
+    const V eye = spread(frame.eye);
+    auto root = [](F a) -> F { return __builtin_elementwise_sqrt(a); };
+    auto magnitude = [](F a) -> F { return __builtin_elementwise_abs(a); };
+    auto length = [&](V a) -> F { return root(dot(a, a)); };
+    auto over = [](V a, F s) -> V { return V{a.x / s, a.y / s, a.z / s}; };
+    auto matrix = [&](const auto& m, V a) -> V {
+        return V{m.data[0][0] * a.x + m.data[0][1] * a.y + m.data[0][2] * a.z,
+            m.data[1][0] * a.x + m.data[1][1] * a.y + m.data[1][2] * a.z,
+            m.data[2][0] * a.x + m.data[2][1] * a.y + m.data[2][2] * a.z};
+    };
+    // optics.safe_normalize
+    auto safe = [&](V a, F& big) -> I {
+        big = size(a);
+        const F total = 0.25f * magnitude(a.x) + 0.25f * magnitude(a.y) + 0.25f * magnitude(a.z);
+        return (big > 0.0f) & (total - total == 0.0f);
+    };
+    auto safe_normalize = [&](V a) -> V {
+        F big;
+        const I fine = safe(a, big);
+        const V s = over(a, big);
+        return vpick(fine, over(s, length(s)), same(0.0f));
+    };
+    auto safe_length = [&](V a) -> F {
+        F big;
+        const I fine = safe(a, big);
+        return pick(fine, big * length(over(a, big)), F(0.0f));
+    };
+    // optics.tangent_basis
+    auto tangents = [&](V n, V& t1, V& t2) {
+        const F sign = pick(n.z < 0.0f, F(-1.0f), F(1.0f));
+        const F a = -1.0f / (sign + n.z);
+        const F both = n.x * n.y * a;
+        t1 = V{1.0f + sign * n.x * n.x * a, sign * both, -sign * n.x};
+        t2 = V{both, sign + n.y * n.y * a, -n.y};
+    };
+    // vertices.edge_reach
+    auto edge_reach = [&](V p, V n, V target, F curvature) -> F {
+        const V to_eye = sub(eye, p);
+        const F d_o = length(to_eye), d_v = length(sub(target, p));
+        const F least_o = fmax(d_o, F(1.0e-20f));
+        const F per_o = 1.0f / least_o;
+        const F cosine = magnitude(dot(n, to_eye)) / least_o;
+        const F least = cosine * cosine * (per_o + 1.0f / fmax(d_v, F(1.0e-20f))) + 2.0f * cosine * curvature;
+        return d_v * root(estimate * d_o * least);
+    };
+    // vertices.virtual_vertex
+    auto virtual_vertex = [&](V p, V n, V target) -> V {
+        const V to_eye = sub(eye, p), to_target = sub(target, p);
+        const F curvature = 1.0f / fmax(length(p), F(1.0e-6f));
+        const F a_length = safe_length(to_eye), b_length = safe_length(to_target);
+        const F c_a = magnitude(dot(to_eye, n));
+        const F behind = dot(to_target, n);
+        const I flat = (c_a + c_a) * curvature * b_length < a_length + b_length;
+        V q = sub(target, times(behind + behind, n));
+        if (bits(~flat)) q = vpick(flat, q, add(p, times(b_length, safe_normalize(sub(p, eye)))));
+        return matrix(frame.eye_from_unit, sub(q, eye));
+    };
+    // layers.project, and the answer of one lane
+    unsigned char* status = (unsigned char*)out_vertex.status.data;
+    float* screen = (float*)out_vertex.screen.data;
+    float* seeds = (float*)out_vertex.seed.data;
+    float* positions = (float*)out_vertex.position.data;
+    const bool placed = out_vertex.position.shape[0] > 0;
+    auto settle = [&](I done, I vertex, V seed, F residual, V image, F reach) {
+        const F depth = dot(spread(camera.forward), image);
+        F x = camera.x_row[0] * image.x + camera.x_row[1] * image.y + camera.x_row[2] * image.z + camera.x_row[3];
+        F y = camera.y_row[0] * image.x + camera.y_row[1] * image.y + camera.y_row[2] * image.z + camera.y_row[3];
+        const I before = depth < camera.near;
+        F key;
+        if (camera.orthographic != 0) {
+            key = pick(before, F(0.0f), 1.0f - depth / camera.far);
+        } else {
+            const F inv = 1.0f / depth;
+            key = pick(before, F(0.0f), inv);
+            x = pick(before, x, x * inv);
+            y = pick(before, y, y * inv);
+        }
+        // By memory: the compiler would store a whole vector for every lane that is taken out of it.
+        const F each[9] = {x, y, key, depth, reach, residual, seed.x, seed.y, seed.z};
+        float lane[9][LANES], place[3][LANES];
+        int to[LANES];
+        for (int k = 0; k < 9; ++k) store(lane[k], each[k]);
+        store(place[0], image.x); store(place[1], image.y); store(place[2], image.z);
+        istore(to, vertex);
+        for (unsigned left = bits(done); left != 0; left &= left - 1) {
+            const int l = __builtin_ctz(left), i = to[l];
+            status[i] = (unsigned char)converged;
+            out_vertex.reach.data[i] = lane[4][l];
+            out_vertex.residual.data[i] = lane[5][l];
+            for (int k = 0; k < 4; ++k) screen[4 * i + k] = lane[k][l];
+            for (int k = 0; k < 3; ++k) seeds[3 * i + k] = lane[6 + k][l];
+            if (placed) {
+                for (int k = 0; k < 3; ++k) positions[3 * i + k] = place[k][l];
+            }
+        }
+    };
+    (void)safe_normalize; (void)safe_length; (void)tangents; (void)edge_reach; (void)virtual_vertex; (void)settle; (void)seeds;
+"""
+
+# `reflector_maps.sample_map`, and of `map_search`: `measure`, `newton_step`, `step_on_cube`.
+REFLECTOR_MAP = r"""
+    const V inv_extent = spread(map.inv_extent);
+    const float* texels = (const float*)map.texels.data;
+    const int resolution = map.resolution;
+    const float scale = 0.5f * (float)(resolution - 1);
+    struct Sample { V p, p_u, p_v, n, n_u, n_v; };
+    struct Law { F residual, cos_eye, cos_target; };
+    // cubemap.project_to_cube
+    auto project_to_cube = [&](V x) -> V {
+        const F m = size(x);
+        return vpick(m == 0.0f, V{F(1.0f), F(0.0f), F(0.0f)}, over(x, m));
+    };
+    auto whole = [&](F f) -> I {
+        I i = __builtin_convertvector(f, I);
+        i = ipick(i < 0, I(0), i);
+        return ipick(i > resolution - 2, I(resolution - 2), i);
+    };
+    // Of a cube point, whose largest component is 1: `cubemap.cube_point` without its divisions.
+    auto sample = [&](V x) -> Sample {
+        const F ax = magnitude(x.x), ay = magnitude(x.y), az = magnitude(x.z);
+        const I on_x = (ax >= ay) & (ax >= az), on_y = ay >= az;
+        const F major = pick(on_x, x.x, pick(on_y, x.y, x.z));
+        const F u = pick(on_x, x.y, pick(on_y, x.z, x.x)), v = pick(on_x, x.z, pick(on_y, x.x, x.y));
+        const I face = ipick(on_x, I(0), ipick(on_y, I(2), I(4))) - (major < 0.0f);
+        const F fu = (u + 1.0f) * scale, fv = (v + 1.0f) * scale;
+        const I i = whole(fu), j = whole(fv);
+        const F a = fu - __builtin_convertvector(i, F), b = fv - __builtin_convertvector(j, F);
+        const I at = 8 * ((face * resolution + j) * resolution + i);
+        F t00[8], t01[8], t10[8], t11[8];
+        gather8(texels, at, t00);
+        gather8(texels + 8, at, t01);
+        gather8(texels + 8 * resolution, at, t10);
+        gather8(texels + 8 * resolution + 8, at, t11);
+        auto three = [](const F* t) -> V { return V{t[0], t[1], t[2]}; };
+        auto between = [&](int k, V& value, V& by_u, V& by_v) {
+            const V c00 = three(t00 + k), c10 = three(t10 + k);
+            const V d0 = sub(three(t01 + k), c00), d1 = sub(three(t11 + k), c10);
+            const V low = add(c00, times(a, d0)), high = add(c10, times(a, d1));
+            by_v = sub(high, low);
+            value = add(low, times(b, by_v));
+            by_u = add(times(1.0f - b, d0), times(b, d1));
+        };
+        Sample s;
+        V raw, n_u, n_v;
+        between(0, s.p, s.p_u, s.p_v);
+        between(4, raw, n_u, n_v);
+        const F inv = 1.0f / fmax(length(raw), F(1.0e-20f));
+        s.n = times(inv, raw);
+        s.n_u = times(inv, n_u);
+        s.n_v = times(inv, n_v);
+        return s;
+    };
+    auto measure = [&](const Sample& s, V target) -> Law {
+        const V to_eye = sub(eye, s.p), to_target = sub(target, s.p);
+        const V o = times(1.0f / fmax(length(to_eye), F(1.0e-20f)), to_eye);
+        const V v = times(1.0f / fmax(length(to_target), F(1.0e-20f)), to_target);
+        const V w = add(o, v);
+        Law law;
+        law.cos_eye = dot(s.n, o);
+        law.cos_target = dot(s.n, v);
+        const F w_n = law.cos_eye + law.cos_target;
+        const F w_t = length(sub(w, times(w_n, s.n)));
+        law.residual = pick(w_n > normal_part_min, w_t / w_n, 1.0e4f - w_n);
+        return law;
+    };
+    auto newton_step = [&](const Sample& s, V target) -> V {
+        const V to_eye = sub(eye, s.p), to_target = sub(target, s.p);
+        const F inv_o = 1.0f / fmax(length(to_eye), F(1.0e-20f)), inv_v = 1.0f / fmax(length(to_target), F(1.0e-20f));
+        const V o = times(inv_o, to_eye), v = times(inv_v, to_target), n = s.n;
+        V t1, t2;
+        tangents(n, t1, t2);
+        const F o1 = dot(t1, o), o2 = dot(t2, o), v1 = dot(t1, v), v2 = dot(t2, v);
+        const F n_o = dot(n, o), n_v = dot(n, v), w_n = n_o + n_v;
+        const F a11 = dot(t1, s.p_u), a12 = dot(t1, s.p_v), a21 = dot(t2, s.p_u), a22 = dot(t2, s.p_v);
+        const F b11 = dot(t1, s.n_u), b12 = dot(t1, s.n_v), b21 = dot(t2, s.n_u), b22 = dot(t2, s.n_v);
+        const F det_p = a11 * a22 - a12 * a21;
+        const F inv_p = pick(magnitude(det_p) > 1.0e-20f, 1.0f / det_p, F(0.0f));
+        const F s11 = fmax((b11 * a22 - b12 * a21) * inv_p, F(0.0f));
+        const F s22 = fmax((b22 * a11 - b21 * a12) * inv_p, F(0.0f));
+        const F bound = root(s11 * s22);
+        const F s12 = fmin(fmax(0.5f * ((b12 * a11 - b11 * a12) + (b21 * a22 - b22 * a21)) * inv_p, -bound), bound);
+        const F k = fmax(w_n, F(0.0f));
+        const F h11 = (1.0f - o1 * o1) * inv_o + (1.0f - v1 * v1) * inv_v + k * s11;
+        const F h22 = (1.0f - o2 * o2) * inv_o + (1.0f - v2 * v2) * inv_v + k * s22;
+        const F h12 = -o1 * o2 * inv_o - v1 * v2 * inv_v + k * s12;
+        const F g1 = o1 + v1, g2 = o2 + v2;
+        const F det_h = h11 * h22 - h12 * h12;
+        const F q1 = s11 * g1 + s12 * g2 + n_o * o1 * inv_o + n_v * v1 * inv_v;
+        const F q2 = s12 * g1 + s22 * g2 + n_o * o2 * inv_o + n_v * v2 * inv_v;
+        const F inv_w = 1.0f / w_n;
+        const F j11 = h11 + g1 * q1 * inv_w, j12 = h12 + g1 * q2 * inv_w;
+        const F j21 = h12 + g2 * q1 * inv_w, j22 = h22 + g2 * q2 * inv_w;
+        const F det_j = j11 * j22 - j12 * j21;
+        const I full = (w_n > normal_part_min) & (det_j > spd_share * det_h) & (det_j > 0.0f);
+        const F det = pick(full, det_j, det_h);
+        const F inv = pick(det > 0.0f, 1.0f / det, F(0.0f));
+        const F d1 = (pick(full, j22, h22) * g1 - pick(full, j12, h12) * g2) * inv;
+        const F d2 = (pick(full, j11, h11) * g2 - pick(full, j21, h12) * g1) * inv;
+        return add(times(d1, t1), times(d2, t2));
+    };
+    auto step_on_cube = [&](V x, V p, V step, F shrink) -> V {
+        const V whitened = product(p, inv_extent), move = product(step, inv_extent);
+        const F cap = fmin(F(1.0f), step_cap * length(whitened) / fmax(length(move), F(1.0e-30f)));
+        return project_to_cube(add(times(size(whitened), x), times(cap * shrink, move)));
+    };
+"""
