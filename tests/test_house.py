@@ -20,7 +20,7 @@ FILES = {
 
 # A module imports from its own floor or below. A new module belongs into this table; `x.*` is a folder.
 FLOORS = {
-    1: "settings launch vector devices optics shapes bodies topology "
+    1: "settings launch vector packets devices optics shapes bodies topology "
     "cubemap quadrics quadric_roots quadric_curve quadric_fit heightfield "
     "grid_rays occupancy voxels "
     "images metrics timing clipping cutouts",
@@ -28,7 +28,7 @@ FLOORS = {
     "segments layers bvh raster raster_vector shade shade_vector surface "
     "surface_vector pictures textures holes cut_shadows "
     "normal_maps bounces direct shadows transmission transmission_vector waves waves_vector channels stage stage.* scene_field "
-    "baked_environments",
+    "baked_environments shadows_vector",
     3: "solve solver solve_device solve_plane solve_convex solve_map solve_general solve_qim solver_gradients mirrors "
     "refraction solve_refraction solver_arrays reflector_maps techniques techniques.* finishes finishes.*",
     4: "planner detail mirrored_eyes effects lighting probe budget choice applicable calibration calibrate realised bake "

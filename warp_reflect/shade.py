@@ -493,6 +493,7 @@ def arriving(
     threads: int = 0,
     shadows: Shadows | None = None,
     without_areas: bool = False,
+    kernels: str = "auto",
 ) -> tuple[wp.array, wp.array]:
     """The light that reaches what a frame shows, as far as it is not the same everywhere.
 
@@ -501,6 +502,7 @@ def arriving(
         normals: From `normal_maps.prepare_normals`.
         shadows: Which lights cast shadows; None: none.
         without_areas: The shapes' light is added where it is used, see `summed_late`.
+        kernels: `Settings.kernels`.
 
     Returns:
         (irradiance of distant lights and shapes vec3 [n], length 0 where there are neither shapes nor shadows: the distant
@@ -514,11 +516,11 @@ def arriving(
         return direct, sky
     points = points_of(scene, gbuffer, layer, threads)
     if asked and shadows.direct:
-        direct = shadowed_irradiance(scene, points, shadows, threads, normals)
+        direct = shadowed_irradiance(scene, points, shadows, threads, normals, kernels)
     elif areas > 0:
         direct = direct_irradiance(scene, scene.lights.direct, points, threads, normals)
     if asked and shadows.domes:
-        sky = sky_share(scene, points, shadows.samples, threads, normals)
+        sky = sky_share(scene, points, shadows.samples, threads, normals, kernels)
     return direct, sky
 
 
@@ -556,11 +558,11 @@ def seen_radiance(
         from warp_reflect import shade_vector  # which shades with this module's structures
 
         areas = summed_late(scene, shadows)
-        direct, sky = arriving(scene, gbuffer, layer, normals, threads, shadows, len(areas) > 0)
+        direct, sky = arriving(scene, gbuffer, layer, normals, threads, shadows, len(areas) > 0, kernels)
         light = [scene.lights, areas, looks, normals, direct, sky, SHARP_ROUGHNESS, ROUGH_ROUGHNESS]
         shade_vector.shade_rays(scene, gbuffer, layer, light, radiance, threads)
         return radiance
-    direct, sky = arriving(scene, gbuffer, layer, normals, threads, shadows)
+    direct, sky = arriving(scene, gbuffer, layer, normals, threads, shadows, kernels=kernels)
     inputs = [scene.view, scene.lights, looks, normals, direct, sky, pixels.direction, layer.triangle, layer.u, layer.v]
     launch.launch(seen_radiance_kernel, pixels.count, [*inputs, radiance], scene.device, threads)
     return radiance
@@ -625,11 +627,11 @@ def shade(
         from warp_reflect import shade_vector  # which shades with this module's structures
 
         areas = summed_late(scene, shadows)
-        direct, sky = arriving(scene, gbuffer, None, normals, threads, shadows, len(areas) > 0)
+        direct, sky = arriving(scene, gbuffer, None, normals, threads, shadows, len(areas) > 0, kernels)
         light = [lights, areas, looks, normals, direct, sky, SHARP_ROUGHNESS, ROUGH_ROUGHNESS]
         shade_vector.shade_eye(scene, gbuffer, light, picture, mirror, threads)
     else:
-        direct, sky = arriving(scene, gbuffer, None, normals, threads, shadows)
+        direct, sky = arriving(scene, gbuffer, None, normals, threads, shadows, kernels=kernels)
         inputs = [scene.view, gbuffer.view, lights, looks, normals, direct, sky, gbuffer.triangle]
         inputs += [gbuffer.reflector_id, picture, mirror]
         launch.launch(shade_kernel, count, inputs, device, threads)

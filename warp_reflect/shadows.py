@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from warp_reflect import launch
+from warp_reflect import launch, vector
 from warp_reflect.bvh import FINITE_FLAGS, TRACE_SPLIT_MIN, flush_direction, ray_offset, scene_facet_normal
 from warp_reflect.direct import CYLINDER, SPHERE, AreaView, DirectView, Points, area_irradiance, shown_area
 from warp_reflect.optics import tangent_basis
@@ -30,12 +30,12 @@ from warp_reflect.surface import hit_normal, shown_normal
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FINITE_FLAGS})
 
-PI = wp.constant(float(np.pi))
 # Rays towards a shape end this share of the way before it, so that a lamp's own surface, drawn where the light is, does
 # not hide it from without.
 SHORT_OF_LIGHT = wp.constant(1.0e-3)
 FAR = wp.constant(3.0e38)
 LEAST_SQUARE = wp.constant(1.0e-30)  # keeps quotients finite
+WHOLE_TURN = wp.constant(float(2.0 * np.pi))
 # 1 / g and 1 / g^2 of g^3 = g + 1.
 R2_X = wp.constant(0.7548776662466927)
 R2_Y = wp.constant(0.5698402909980532)
@@ -177,6 +177,31 @@ def sample_place(k: int, shift: wp.vec2) -> wp.vec2:
 
 
 @wp.func
+def turn(share: float) -> wp.vec2:
+    """Cosine and sine of a share of a whole turn, 0 to 1, within 1.2e-7: sums and products, the same bits in vectors.
+
+    Source: the polynomials of Moshier's Cephes library, single/sinf.c, on an eighth of a turn to either side.
+    """
+    quarter = wp.floor(4.0 * share + 0.5)
+    a = WHOLE_TURN * (share - 0.25 * quarter)
+    square = a * a
+    s = a + a * square * (-1.6666654611e-1 + square * (8.3321608736e-3 + square * -1.9515295891e-4))
+    c = (
+        1.0
+        - 0.5 * square
+        + square * square * (4.166664568298827e-2 + square * (-1.388731625493765e-3 + square * 2.443315711809948e-5))
+    )
+    q = int(quarter) & 3
+    cosine = wp.where((q & 1) != 0, s, c)
+    sine = wp.where((q & 1) != 0, c, s)
+    if q == 1 or q == 2:
+        cosine = -cosine
+    if q >= 2:
+        sine = -sine
+    return wp.vec2(cosine, sine)
+
+
+@wp.func
 def sphere_sample(light: AreaView, p: wp.vec3, place: wp.vec2) -> wp.vec4:
     """Unit direction to a point of a sphere's visible cap, even in solid angle, and its distance."""
     to_centre = light.centre - p
@@ -186,9 +211,9 @@ def sphere_sample(light: AreaView, p: wp.vec3, place: wp.vec2) -> wp.vec4:
     # 1 - cos of the angle from the axis.
     fall = place[0] * square / (1.0 + wp.sqrt(1.0 - square))
     sine = wp.sqrt(wp.max(fall * (2.0 - fall), 0.0))
-    angle = 2.0 * PI * place[1]
+    angle = turn(place[1])
     t1, t2 = tangent_basis(axis)
-    d = (1.0 - fall) * axis + sine * (wp.cos(angle) * t1 + wp.sin(angle) * t2)
+    d = (1.0 - fall) * axis + sine * (angle[0] * t1 + angle[1] * t2)
     half = wp.sqrt(wp.max(light.radius * light.radius - distance * distance * sine * sine, 0.0))
     return wp.vec4(d[0], d[1], d[2], distance * (1.0 - fall) - half)
 
@@ -202,9 +227,8 @@ def polygon_sample(light: AreaView, p: wp.vec3, place: wp.vec2) -> wp.vec4:
         half = wp.sqrt(0.5)
         at += (2.0 * place[0] - 1.0) * half * light.x + (2.0 * place[1] - 1.0) * half * light.y
     else:
-        angle = 2.0 * PI * place[1]
-        radius = wp.sqrt(place[0])
-        at += radius * (wp.cos(angle) * light.x + wp.sin(angle) * light.y)
+        angle = turn(place[1])
+        at += wp.sqrt(place[0]) * (angle[0] * light.x + angle[1] * light.y)
     to = at - p
     distance = wp.length(to)
     d = unit(to)
@@ -437,9 +461,8 @@ def light_shares_kernel(
 def sky_ray(n: wp.vec3, place: wp.vec2) -> wp.vec3:
     """A direction of a cosine distribution about a unit normal."""
     t1, t2 = tangent_basis(n)
-    angle = 2.0 * PI * place[1]
-    radius = wp.sqrt(place[0])
-    return radius * (wp.cos(angle) * t1 + wp.sin(angle) * t2) + wp.sqrt(wp.max(1.0 - place[0], 0.0)) * n
+    angle = turn(place[1])
+    return wp.sqrt(place[0]) * (angle[0] * t1 + angle[1] * t2) + wp.sqrt(wp.max(1.0 - place[0], 0.0)) * n
 
 
 @wp.kernel
@@ -488,7 +511,12 @@ def first_count(samples: int) -> int:
 
 
 def shadowed_irradiance(
-    scene: Scene, points: Points, cast: Shadows, threads: int = 0, normals: wp.array | None = None
+    scene: Scene,
+    points: Points,
+    cast: Shadows,
+    threads: int = 0,
+    normals: wp.array | None = None,
+    kernels: str = "auto",
 ) -> wp.array:
     """Irradiance of distant lights and shapes at points, with the shadows asked for.
 
@@ -498,6 +526,7 @@ def shadowed_irradiance(
         cast: Which lights are asked by rays, and by how many.
         threads: CPU threads; 0: one per core.
         normals: From `normal_maps.prepare_normals`; None: no normal maps.
+        kernels: `Settings.kernels`. Scenes with cut-outs have plain ones only.
 
     Returns:
         vec3 [points], on the viewer's side; 0 where nothing is seen.
@@ -505,30 +534,44 @@ def shadowed_irradiance(
     device = scene.device
     count = len(points.triangle)
     result = wp.zeros(count, dtype=wp.vec3, device=device)
-    areas = _flags(cast.areas, device)
-    world = [wp.uint64(scene.shadow_tracer.id), scene.view, scene.lights.direct]
+    distant, areas = _flags(cast.distant, device), _flags(cast.areas, device)
+    mesh, lights = wp.uint64(scene.shadow_tracer.id), scene.lights.direct
     at = [*_arrays(points, normals, device), points.pixel, points.width]
     if scene.has_hole is not None:
         from warp_reflect import cut_shadows  # only scenes with cut-outs need it
 
-        inputs = [*world, _flags(cast.distant, device), areas, *at, cast.samples]
+        inputs = [mesh, scene.view, lights, distant, areas, *at, cast.samples]
         cut_shadows.cut_irradiance(inputs, result, threads)
         return result
     found = wp.zeros(count * len(areas) if any(cast.areas) else 0, dtype=wp.uint8, device=device)
     index = wp.zeros(0, dtype=int, device=device)
+    if any(cast.areas) and len(points.pixel):
+        index = wp.full(points.width * points.height, -1, dtype=int, device=device)
+        launch.launch(image_index_kernel, count, [points.pixel, index], device, threads)
+    if vector.chosen(kernels, device):
+        from warp_reflect import shadows_vector  # which sends this module's rays
+
+        starts = shadows_vector.starts_of([scene.view, lights, *at], count, len(areas), device, threads)
+        if any(cast.areas):
+            shadows_vector.send_first(mesh, lights, areas, starts, count, first_count(cast.samples), found, threads)
+        around = [points.pixel, points.width, found, index]
+        shadows_vector.send_all(mesh, lights, distant, areas, starts, count, cast.samples, around, result, threads)
+        return result
     if any(cast.areas):
-        if len(points.pixel):
-            index = wp.full(points.width * points.height, -1, dtype=int, device=device)
-            launch.launch(image_index_kernel, count, [points.pixel, index], device, threads)
-        inputs = [*world, areas, *at, first_count(cast.samples), found]
+        inputs = [mesh, scene.view, lights, areas, *at, first_count(cast.samples), found]
         launch.launch(first_rays_kernel, count, inputs, device, threads, split_min=TRACE_SPLIT_MIN)
-    inputs = [*world, _flags(cast.distant, device), areas, *at, cast.samples, found, index, result]
+    inputs = [mesh, scene.view, lights, distant, areas, *at, cast.samples, found, index, result]
     launch.launch(shadowed_kernel, count, inputs, device, threads, split_min=TRACE_SPLIT_MIN)
     return result
 
 
 def sky_share(
-    scene: Scene, points: Points, samples: int, threads: int = 0, normals: wp.array | None = None
+    scene: Scene,
+    points: Points,
+    samples: int,
+    threads: int = 0,
+    normals: wp.array | None = None,
+    kernels: str = "auto",
 ) -> wp.array:
     """Share of the cosine-weighted sky over points that is not hidden by the scene.
 
@@ -537,25 +580,35 @@ def sky_share(
         points: What is seen.
         samples: Rays a point.
         threads: CPU threads; 0: one per core.
-        normals: As for `shadowed_irradiance`.
+        normals, kernels: As for `shadowed_irradiance`.
 
     Returns:
         float32 [points], 0 where nothing is seen.
     """
     device = scene.device
-    result = wp.zeros(len(points.triangle), dtype=float, device=device)
-    inputs = [wp.uint64(scene.shadow_tracer.id), scene.view, *_arrays(points, normals, device)]
-    inputs += [points.pixel, points.width, samples, result]
+    count = len(points.triangle)
+    result = wp.zeros(count, dtype=float, device=device)
+    mesh = wp.uint64(scene.shadow_tracer.id)
+    at = [*_arrays(points, normals, device), points.pixel, points.width]
     if scene.has_hole is not None:
         from warp_reflect import cut_shadows
 
-        cut_shadows.cut_sky_share(inputs[:-1], result, threads)
+        cut_shadows.cut_sky_share([mesh, scene.view, *at, samples], result, threads)
         return result
-    launch.launch(sky_share_kernel, len(points.triangle), inputs, device, threads, split_min=TRACE_SPLIT_MIN)
+    if vector.chosen(kernels, device):
+        from warp_reflect import shadows_vector
+
+        starts = shadows_vector.starts_of([scene.view, scene.lights.direct, *at], count, 0, device, threads)
+        shadows_vector.send_to_sky(mesh, starts, count, samples, result, threads)
+        return result
+    inputs = [mesh, scene.view, *at, samples, result]
+    launch.launch(sky_share_kernel, count, inputs, device, threads, split_min=TRACE_SPLIT_MIN)
     return result
 
 
-def light_shares(scene: Scene, points: Points, samples: int, threads: int = 0) -> tuple[np.ndarray, ...]:
+def light_shares(
+    scene: Scene, points: Points, samples: int, threads: int = 0, kernels: str = "auto"
+) -> tuple[np.ndarray, ...]:
     """What each light would bring to points, and which share of it arrives; without normal maps, cut-outs uncut.
 
     Returns:

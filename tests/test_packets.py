@@ -1,0 +1,291 @@
+"""Rays in packets: against all triangles one by one, against Warp's own queries, and the shadows they find."""
+
+import numpy as np
+import pytest
+import warp as wp
+from test_shade import WHITE, ball_mesh, distant, dome, ground, look_at, place, scene_of, turned
+
+import warp_reflect as wr
+from warp_reflect import direct, raster, shadows, vector
+from warp_reflect.launch import FINITE_FLAGS, launch
+from warp_reflect.packets import TRAVERSAL
+from warp_reflect.scene import LightData, MaterialData
+
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FINITE_FLAGS})
+CPU = wp.get_device("cpu")
+FAR = 3.0e38
+
+
+@wp.func_native(
+    vector.snippet(
+        TRAVERSAL
+        + r"""
+    const int count = origins.shape[0];
+    const int begin = block * BLOCK;
+    const int end = begin + BLOCK < count ? begin + BLOCK : count;
+    for (int start = begin; start < end; start += LANES) {
+        const I valid = start + lanes() < end;
+        const I own = ipick(valid, start + lanes(), I(end - 1));
+        const V o = vgather((const float*)origins.data, own), d = vgather((const float*)directions.data, own);
+        const F far = gather(reach.data, own);
+        const I met = is_met(valid, o, d, far);
+        const Met nearest = first_met(valid, o, d, far);
+        for (int l = 0; l < LANES && start + l < end; ++l) {
+            out_met.data[start + l] = met[l] != 0;
+            out_face.data[start + l] = nearest.face[l];
+            if (nearest.face[l] < 0) continue;
+            out_t.data[start + l] = nearest.t[l];
+            out_u.data[start + l] = nearest.u[l];
+            out_v.data[start + l] = nearest.v[l];
+        }
+    }
+"""
+    )
+)
+def query_block(
+    block: int,
+    mesh_id: wp.uint64,
+    origins: wp.array(dtype=wp.vec3),
+    directions: wp.array(dtype=wp.vec3),
+    reach: wp.array(dtype=float),
+    out_met: wp.array(dtype=int),
+    out_face: wp.array(dtype=int),
+    out_t: wp.array(dtype=float),
+    out_u: wp.array(dtype=float),
+    out_v: wp.array(dtype=float),
+): ...
+
+
+@wp.kernel
+def query_blocks_kernel(
+    first: int,
+    mesh_id: wp.uint64,
+    origins: wp.array(dtype=wp.vec3),
+    directions: wp.array(dtype=wp.vec3),
+    reach: wp.array(dtype=float),
+    out_met: wp.array(dtype=int),
+    out_face: wp.array(dtype=int),
+    out_t: wp.array(dtype=float),
+    out_u: wp.array(dtype=float),
+    out_v: wp.array(dtype=float),
+):
+    block = first + wp.tid()
+    query_block(block, mesh_id, origins, directions, reach, out_met, out_face, out_t, out_u, out_v)
+
+
+@wp.kernel
+def query_kernel(
+    first: int,
+    mesh_id: wp.uint64,
+    origins: wp.array(dtype=wp.vec3),
+    directions: wp.array(dtype=wp.vec3),
+    reach: wp.array(dtype=float),
+    out_met: wp.array(dtype=int),
+    out_face: wp.array(dtype=int),
+    out_t: wp.array(dtype=float),
+    out_u: wp.array(dtype=float),
+    out_v: wp.array(dtype=float),
+):
+    i = first + wp.tid()
+    out_face[i] = -1
+    if wp.mesh_query_ray_anyhit(mesh_id, origins[i], directions[i], reach[i]):
+        out_met[i] = 1
+    query = wp.mesh_query_ray(mesh_id, origins[i], directions[i], reach[i])
+    if query.result:
+        out_face[i] = query.face
+        out_t[i] = query.t
+        out_u[i] = query.u
+        out_v[i] = query.v
+
+
+def answers(points, triangles, origins, directions, reach=FAR, threads=1, leaf_size=4):
+    """(Warp's, the packets'): whether something is met, the nearest face, t, u, v."""
+    mesh = wp.Mesh(
+        wp.array(np.float32(points), dtype=wp.vec3, device=CPU),
+        wp.array(np.int32(triangles).reshape(-1), dtype=int, device=CPU),
+        bvh_constructor="sah",
+        bvh_leaf_size=leaf_size,
+    )
+    n = len(origins)
+    reach = np.broadcast_to(np.float32(reach), n)
+    inputs = [wp.uint64(mesh.id)]
+    for values, kind in ((origins, wp.vec3), (directions, wp.vec3), (reach, float)):
+        inputs.append(wp.array(np.ascontiguousarray(values, np.float32), dtype=kind, device=CPU))
+    result = []
+    for launched, kernel in ((launch, query_kernel), (vector.launch_blocks, query_blocks_kernel)):
+        outputs = [wp.zeros(n, dtype=kind, device=CPU) for kind in (int, int, float, float, float)]
+        launched(kernel, n, inputs + outputs, CPU, threads)
+        result.append([output.numpy() for output in outputs])
+    return result
+
+
+def one_by_one(points, triangles, origins, directions):
+    """Distance to every triangle's plane and the least weight there, float64 [rays, triangles]; Cramer's rule."""
+    p = np.float32(points).astype(np.float64)
+    a, b, c = p[triangles[:, 0]], p[triangles[:, 1]], p[triangles[:, 2]]
+    o, d = (np.float32(each).astype(np.float64)[:, None] for each in (origins, directions))
+    normal = np.cross(b - a, c - a)
+    det = -np.einsum("rtk,tk->rt", np.broadcast_to(d, (len(o), len(a), 3)), normal)
+    with np.errstate(all="ignore"):
+        t = np.einsum("rtk,tk->rt", o - a, normal) / det
+        across = np.cross(o - a, np.broadcast_to(d, (len(o), len(a), 3)))
+        u = np.einsum("rtk,tk->rt", across, c - a) / det
+        v = -np.einsum("rtk,tk->rt", across, b - a) / det
+    return t, np.minimum(np.minimum(u, v), 1.0 - u - v)
+
+
+RAYS = {
+    "spread": lambda rng, n: rng.normal(size=(n, 3)),
+    "alike": lambda rng, n: np.array([0.2, -0.5, 0.8]) + 0.05 * rng.normal(size=(n, 3)),
+    "along an axis": lambda rng, n: np.eye(3)[rng.integers(0, 3, n)] * rng.choice([-1.0, 1.0], (n, 1)),
+    "in a plane": lambda rng, n: rng.normal(size=(n, 3)) * (np.arange(3) != rng.integers(0, 3, (n, 1))),
+}
+
+
+@pytest.mark.parametrize("kind", RAYS)
+def test_packets_meet_what_all_triangles_asked_one_by_one_say(kind):
+    """Fails where the layout of Warp's tree is not the one that packets walk down."""
+    rng = np.random.default_rng(3)
+    triangle_count, n = 700, 1500
+    middle = rng.uniform(-2, 2, (triangle_count, 1, 3))
+    points = (middle + rng.normal(size=(triangle_count, 3, 3)) * 0.2).reshape(-1, 3)
+    triangles = np.arange(3 * triangle_count).reshape(-1, 3)
+    origins = rng.uniform(-2, 2, (n, 3))
+    d = RAYS[kind](rng, n)
+    d = np.float32(d / np.linalg.norm(d, axis=1, keepdims=True))
+    reach = rng.choice([0.5, 1.5, FAR], n)
+    t, inside = one_by_one(points, triangles, origins, d)
+    met = (inside > 0) & (t > 0) & (t < reach[:, None])
+    # Rays that pass a border, or end at a triangle, by less than the digits of float32 may go either way.
+    near = np.abs(inside) < 1e-4
+    sure = ~((np.abs(t) < 1e-4) | (np.abs(t - reach[:, None]) < 1e-4)).any(axis=1) & ~(near & (t > 0)).any(axis=1)
+    assert sure.mean() > 0.8 and 0.1 < met[sure].any(axis=1).mean() < 0.95
+    first = np.where(met, t, np.inf)
+    face = np.where(met.any(axis=1), first.argmin(axis=1), -1)
+    for leaf_size in (1, 4):
+        _, got = answers(points, triangles, origins, d, reach, leaf_size=leaf_size)
+        np.testing.assert_array_equal(got[0][sure] != 0, met[sure].any(axis=1))
+        np.testing.assert_array_equal(got[1][sure], face[sure])
+        hit = sure & (face >= 0)
+        np.testing.assert_allclose(got[2][hit], first.min(axis=1)[hit], rtol=1e-4, atol=1e-5)
+
+
+def grid_of(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """A flat sheet of n x n squares, two triangles each, with whole coordinates: every edge is met exactly."""
+    x, z = np.meshgrid(np.arange(n + 1), np.arange(n + 1))
+    points = np.stack([x, np.zeros_like(x), z], -1).reshape(-1, 3)
+    at = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).reshape(-1)
+    triangles = np.concatenate([np.stack([at, at + n + 1, at + 1], -1), np.stack([at + 1, at + n + 1, at + n + 2], -1)])
+    return points.astype(np.float64), triangles
+
+
+def hard_case(name: str, rng) -> tuple[np.ndarray, ...]:
+    points, triangles = grid_of(12)
+    n = 4000
+    at = rng.uniform(0, 12, (n, 3)) * (1, 0, 1)
+    if name == "edges and corners":
+        at = np.round(at * 2) / 2
+    elif name == "two sheets in one plane":
+        points = np.concatenate([points, points])
+        triangles = np.concatenate([triangles, triangles + len(points) // 2])
+    elif name == "a soup of slivers":
+        points = points + rng.normal(size=points.shape) * (0.5, 1e-4, 0.5)
+    elif name == "no area":
+        triangles[::2, 1] = triangles[::2, 0]
+    elif name == "far from the origin":
+        points, at = points + 1.0e4, at + 1.0e4
+    origins = at + rng.normal(size=(n, 3)) * (2, 0, 2) + (0, 3, 0)
+    if name == "from the surface":
+        origins = at + (0, 1e-6, 0)
+    d = at - origins + rng.normal(size=(n, 3)) * (name == "from the surface")
+    if name == "straight down":
+        origins, d = at + (0, 3, 0), np.broadcast_to((0.0, -1.0, 0.0), (n, 3))
+    return points, triangles, origins, d / np.linalg.norm(d, axis=1, keepdims=True)
+
+
+CASES = {
+    "edges and corners": 0.1,
+    "straight down": 0.0,
+    "two sheets in one plane": 0.2,
+    "a soup of slivers": 1e-3,
+    "no area": 1e-3,
+    "far from the origin": 1e-3,
+    "from the surface": 1e-3,
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_packets_answer_as_warp_does_ray_by_ray(case):
+    """What is met at all, bit for bit, and how far; another face only where two are met at the same distance."""
+    points, triangles, origins, d = hard_case(case, np.random.default_rng(7))
+    own, packed = answers(points, triangles, origins, d)
+    assert own[0].any()
+    np.testing.assert_array_equal(packed[0], own[0])
+    np.testing.assert_array_equal(packed[1] >= 0, own[1] >= 0)
+    other = packed[1] != own[1]
+    assert other.mean() <= CASES[case]
+    np.testing.assert_allclose(packed[2], own[2], rtol=1e-5, atol=1e-6)
+    for k in (2, 3, 4):
+        np.testing.assert_array_equal(packed[k][~other], own[k][~other])
+    for k, again in enumerate(answers(points, triangles, origins, d, threads=2)[1]):
+        np.testing.assert_array_equal(packed[k], again)
+
+
+def test_nothing_is_met_in_a_tree_of_points():
+    """Shrunk triangles, as a scene's structure has them for what casts no shadow."""
+    points, triangles = grid_of(3)
+    triangles = np.repeat(triangles[:, :1], 3, axis=1)
+    origins = np.float32([[0.5, 1.0, 0.5], [1.0, 1.0, 1.0]])
+    down = np.float32([[0, -1, 0], [0, -1, 0]])
+    own, packed = answers(points, triangles, origins, down)
+    assert not own[0].any() and not packed[0].any() and (packed[1] == -1).all()
+
+
+LIGHTS = [
+    distant((1, 1, 1), (0.35, 1.0, 0.1)),
+    distant((1, 1, 1), (0.0, 1.0, 0.0)),
+    LightData("/rect", "rect", (3, 1, 1), turned(-1.4, 0.4, (0.3, 2.0, 0.2)), size=(1.2, 0.8)),
+    LightData("/disk", "disk", (1, 3, 1), turned(-1.5, 0.4, (-1.2, 2.0, 0.2)), size=(0.4,)),
+    LightData("/sphere", "sphere", (1, 1, 3), turned(0, 0, (0.3, 2.2, -0.2)), size=(0.5,)),
+    LightData("/cylinder", "cylinder", (2, 2, 1), turned(0, 0.4, (0.3, 2.0, 0.9)), size=(1.4, 0.04)),
+    LightData("/around", "sphere", (1, 1, 1), place(0, 0.0, 0), size=(0.5,)),
+    dome(),
+]
+
+
+def lit_balls(material=WHITE):
+    balls = [(ball_mesh(), place(0, 0.8, 0, 0.5), material), (ball_mesh(), place(1, 0.5, 1, 0.4), WHITE)]
+    scene = scene_of([(ground(), place(), WHITE), *balls], LIGHTS)
+    return scene, look_at((0, 3.0, 4.0), (0, 0.3, 0), fov=50, size=(67, 43))
+
+
+@pytest.mark.parametrize("samples", [1, 5, 16, 40])
+def test_shadows_are_found_bit_for_bit_as_the_plain_kernels_find_them(samples):
+    scene, camera = lit_balls()
+    points = direct.points_of(scene, raster.draw_scene(scene, camera))
+    every = shadows.every_shadow(scene, samples)
+    some = shadows.Shadows((False, True), (True, False, True, False, True), samples=samples)
+    sky = shadows.sky_share(scene, points, samples, 1, kernels="plain").numpy()
+    assert 0.0 < sky.mean() < 1.0
+    for cast in (every, some):
+        plain = shadows.shadowed_irradiance(scene, points, cast, 1, kernels="plain").numpy()
+        assert plain.any()
+        for threads in (1, 2):
+            got = shadows.shadowed_irradiance(scene, points, cast, threads, kernels="vector").numpy()
+            np.testing.assert_array_equal(got, plain)
+    for threads in (1, 2):
+        got = shadows.sky_share(scene, points, samples, threads, kernels="vector").numpy()
+        np.testing.assert_array_equal(got, sky)
+
+
+def test_a_mirror_shows_the_same_shadows_bit_for_bit():
+    """What a mirror shows are points of some pixels only."""
+    scene, camera = lit_balls(MaterialData(base_color=(1, 1, 1), metallic=1.0, roughness=0.0))
+    frames = []
+    for kernels in ("plain", "vector"):
+        settings = wr.Settings(kernels=kernels, shadows=True, dome_shadows=True, threads=1)
+        plan = wr.make_plan(scene, camera, size=camera.size, settings=settings)
+        assert plan.shadows.direct and plan.rows
+        frames.append(wr.render_frame(scene, plan)["reflection"])
+    assert frames[0].any()
+    np.testing.assert_array_equal(*frames)
