@@ -31,8 +31,10 @@ def test_what_maps_hold_too_coarsely_is_shaded(bench):
     fine, coarse = (
         bench.measure(scene, part, references, settings.replace(rem_blur_px=blur), 1, 12.0) for blur in (2.0, 0.0)
     )
-    assert fine["angle_deg"] <= coarse["angle_deg"] and fine["difference"] < min(0.02, coarse["difference"])
-    assert fine["unseen"] > coarse["unseen"]
+    assert fine["angle_deg"] < coarse["angle_deg"] <= coarse["angle_95_deg"] <= 180.0
+    assert fine["difference"] < min(0.02, coarse["difference"])
+    assert fine["unseen"] > coarse["unseen"] and fine["shaded"] > coarse["shaded"]
+    assert fine["sky"] == coarse["sky"] < 0.01  # of either's rays
     assert 0.0 < fine["local_ms"] and 0.0 < fine["drawn_ms"] and fine["rays"] <= 6 * 32 * 32
 
 
@@ -41,6 +43,25 @@ def bench_arguments():
         mirrors = 1
 
     return Arguments
+
+
+def test_angles_of_a_map_at_a_reference_map_are_small_and_grow_with_the_way(bench):
+    """Texels show their own points but for half a texel where both eyes are one."""
+    scene = wr.load_stage(ROOT / "usd_scenes" / "city_block.usda", time=12.0)
+    part = bench.mirrors(scene, bench_arguments())[0]
+    settings = wr.Settings(environment_resolution=32, rem_texels="full", rem_blur_px=0.0, bounces=1, rem_count=1)
+    centre = bench.centre_of(scene, part)
+    medians = []
+    for away in (0.0, 0.5, 5.0):
+        placed = reference_maps.Placement(("",), centre[None] + [away, 0, 0], np.eye(3)[None])
+        maps = reference_maps.draw_maps(scene, placed, settings)
+        key = reference_maps._key(settings)
+        scene.environments[key] = reference_maps.ReferenceMaps(maps, placed, (), float("inf"))
+        bench.forget(scene)
+        made = bench.layered_environment.prepare(scene, bench._Reflector(part), settings)
+        medians.append(float(np.median(bench.angles(scene, made, scene.environments[key], settings)["degrees"])))
+    texel = 90.0 / 32
+    assert medians[0] < 0.05 * texel and medians[0] < medians[1] < medians[2]
 
 
 def test_rays_find_their_texels(bench):

@@ -19,7 +19,7 @@ from warp_reflect.cubemap import RADIANCE_AXES, texel_directions
 from warp_reflect.environment_maps import CubeMapsView
 from warp_reflect.scene import EnvironmentMapData, InstanceData, LightData, MaterialData, Scene
 from warp_reflect.shadows import asked_shadows
-from warp_reflect.techniques import local_map, reference_maps
+from warp_reflect.techniques import local_map, local_mesh, reference_maps
 from warp_reflect.techniques.local_map import REMS_MAX, RemWeights
 
 wp.set_module_options({"enable_backward": False})
@@ -181,9 +181,9 @@ def no_rays(directions):
     return np.zeros(len(directions), np.float32), np.full(len(directions), -1, np.int32)
 
 
-def mesh_at(depth: float, edge: int) -> local_map.DepthMesh:
+def mesh_at(depth: float, edge: int) -> local_mesh.DepthMesh:
     """Everything at one depth along the faces' axes, all texels traced."""
-    mesh = local_map.DepthMesh.empty(edge)
+    mesh = local_mesh.DepthMesh.empty(edge)
     mesh.inverse[:], mesh.traced[:] = 1.0 / depth, True
     return mesh
 
@@ -281,7 +281,7 @@ def test_edges_against_the_sky_are_refined_at_any_depth(near, device):
         return distance.astype(np.float32), np.where(hit, 0, -1).astype(np.int32)
 
     edge = 32
-    mesh = local_map.trace_depth_mesh(edge, intersect, 4, 0.25, device)
+    mesh = local_mesh.trace_depth_mesh(edge, intersect, 4, 0.25, device)
     directions = texel_directions(edge).reshape(-1, 3)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     expected = (intersect(directions.astype(np.float32))[1] >= 0).reshape(6, edge, edge)

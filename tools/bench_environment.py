@@ -4,9 +4,11 @@
 
 For some moving mirrors of a stage at some times, contenders in turn in one process with the same number of threads and the
 same resolution: the local map from the nearest two reference maps (rays, blending, what no map sees shaded, what moves drawn
-in), and the six faces drawn, shadows included in both. Beside the time: the median angle by which what a texel shows is off,
-as seen from the map's eye, the colour difference as flip has it over the six faces, the share of texels that no map sees, and
-the memory of the stage's maps and of 54 maps of 128 texels. Times are of this process on the processor, not of the wall.
+in), and the six faces drawn, shadows included in both. Beside the time, of the texels that are blended: the angle by which
+what they show is off, as seen from the map's eye, median and 95 %, and the share of what is shown that lies nearer or farther;
+shares of texels that are sky in one of map and truth alone, and that are shaded where they are; the colour difference as FLIP
+has it over the six faces; the memory of the stage's maps and of 54 maps of 128 texels. Times are of this process on the
+processor, not of the wall.
 """
 
 from __future__ import annotations
@@ -23,10 +25,10 @@ from warp_reflect import environment_maps
 from warp_reflect.cubemap import RADIANCE_AXES, texel_directions
 from warp_reflect.devices import open_device
 from warp_reflect.shadows import asked_shadows
-from warp_reflect.techniques import layered_environment, local_map, reference_maps
+from warp_reflect.techniques import layered_environment, local_map, local_mesh, reference_maps
 from warp_reflect.techniques.environment import centre_of
 
-SEEN_SLACK = 0.02  # of a distance: what a map has so little before a point is the point
+DEPTH_APART = 0.05  # of a distance: what is shown and lies farther off than this is another thing
 PALETTE_BYTES = 1024 * 8
 
 
@@ -36,9 +38,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--resolution", type=int, default=128)
     parser.add_argument("--mirrors", type=int, default=4)
     parser.add_argument("--time", type=float, action="append", help="time code; may be repeated")
-    parser.add_argument(
-        "--blur", type=float, default=wr.Settings.rem_blur_px, help="rem_blur_px: what maps hold too coarsely is shaded"
-    )
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="a setting; may be repeated")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--json", action="store_true")
@@ -52,9 +52,8 @@ def main() -> None:
         environment_resolution=arguments.resolution,
         threads=arguments.threads,
         rem_texels="full",
-        rem_blur_px=arguments.blur,
         bounces=1,
-    )
+    ).replace(**dict(each.split("=", 1) for each in arguments.set))
     rows, scene = [], None
     for when in arguments.time or [12.0, 30.0]:
         before = scene
@@ -70,6 +69,7 @@ def main() -> None:
         "local_ms": statistics.median(row["local_ms"] for row in rows),
         "drawn_ms": statistics.median(row["drawn_ms"] for row in rows),
         "angle_deg": statistics.median(row["angle_deg"] for row in rows),
+        "angle_95_deg": statistics.median(row["angle_95_deg"] for row in rows),
         "flip": statistics.median(row["flip"] for row in rows),
         "maps": references.maps.count,
         "packed_MB": environment_maps.pack_maps(references.maps).bytes / 1e6,
@@ -84,13 +84,14 @@ def main() -> None:
             print(json.dumps(row))
         return
     print(
-        f"{'mirror':28} {'time':>5} {'local':>8} {'drawn':>8} {'ratio':>6} {'angle':>7} {'flip':>6} {'unseen':>7} {'rays':>6}"
+        "| mirror | time | local ms | drawn ms | faster | angle, median | 95 % | another depth | sky | shaded | FLIP |"
     )
+    print("|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|")
     for row in rows:
         print(
-            f"{row['mirror'][-28:]:28} {row['time']:5g} {row['local_ms']:6.1f}ms {row['drawn_ms']:6.0f}ms "
-            f"{row['drawn_ms'] / row['local_ms']:6.1f} {row['angle_deg']:6.3f}° {row['flip']:6.3f} "
-            f"{100 * row['unseen']:6.2f}% {row['rays']:6}"
+            f"| {row['mirror']} | {row['time']:g} | {row['local_ms']:.1f} | {row['drawn_ms']:.0f} | "
+            f"{row['drawn_ms'] / row['local_ms']:.1f}x | {row['angle_deg']:.3f} deg | {row['angle_95_deg']:.2f} deg | "
+            f"{100 * row['other']:.1f} % | {100 * row['sky']:.2f} % | {100 * row['shaded']:.0f} % | {row['flip']:.3f} |"
         )
     print(", ".join(f"{name} {value:.4g}" for name, value in summary.items()))
 
@@ -123,16 +124,19 @@ def measure(scene, part: int, references, settings, rounds: int, when: float) ->
                 threads=settings.threads,
             )
             drawn.append(time.process_time() - start)
-    return {
+    off = angles(scene, made, references, settings)
+    degrees = off.pop("degrees")
+    return off | {
         "mirror": scene.parts[part].prim_path,
         "time": when,
         "local_ms": 1e3 * statistics.median(local[1:]),
         "drawn_ms": 1e3 * statistics.median(drawn[1:]),
-        "angle_deg": float(np.median(angles(scene, made, references.maps, settings))),
+        "angle_deg": float(np.median(degrees)) if len(degrees) else 0.0,
+        "angle_95_deg": float(np.quantile(degrees, 0.95)) if len(degrees) else 0.0,
         "difference": float(np.abs(shown(made.local) - shown(whole)).mean()),
         "flip": flip(shown(made.local), shown(whole)),
         "unseen": made.statistics["rem_missing"] / max(made.statistics["rem_texels"], 1),
-        "rays": made.statistics["local_rays"],
+        "rays": made.statistics.get("local_rays", 0),
         "timings": made.timings,
     }
 
@@ -150,30 +154,75 @@ def forget(scene) -> None:
         del scene.environments[key]
 
 
-def angles(scene, made, maps, settings) -> np.ndarray:
-    """Degrees by which what each texel shows is off: what the map nearest to the mirror that sees the point has there."""
-    n = made.local.resolution
+def angles(scene, made, references, settings) -> dict[str, np.ndarray | float]:
+    """By how much what a local map shows is off, as its eye sees it, of texels that are blended.
+
+    A texel's ray meets the triangles at its own point. What it shows is what each reference map has in the direction that the
+    texel looks it up in, weighted: the angle at the eye between that and the ray; the sky is infinitely far.
+
+    Returns:
+        `degrees`: of texels that show a surface and whose ray meets one; `shaded`, `sky`: shares of the texels that are shaded
+        where they are, and of all others that are sky in one of map and truth alone; `other`: of those in `degrees`, which show
+        what is nearer or farther than their point by more than `DEPTH_APART`.
+    """
+    n, state = made.local.resolution, made.state.numpy()
     directions = texel_directions(n).reshape(-1, 3)
     directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    distance = made.local.distance(0).reshape(-1).astype(np.float64)
-    points = made.centre + distance[:, None] * directions
-    best, known = np.zeros(len(points)), np.zeros(len(points), bool)
-    for k in layered_environment.nearest_maps(made.references, made.centre, settings.rem_count):
-        ray = points - maps.centres[k]
-        far = maps.distance(int(k)).reshape(-1)[texel_of(ray, n)].astype(np.float64)
-        length = np.linalg.norm(ray, axis=1)
-        shown = maps.centres[k] + far[:, None] * ray / np.maximum(length, 1e-30)[:, None] - made.centre
+    intersect = layered_environment.intersect_still(scene, made.part, made.centre, settings.threads)
+    true = intersect(directions.astype(np.float32))[0].astype(np.float64)
+    points = made.centre + made.local.distance(0).reshape(-1, 1).astype(np.float64) * directions
+    rems = layered_environment.nearest_maps(references, made.centre, settings.rem_count)
+    share = weights(scene, made, references.maps, rems, settings)
+    angle, other = np.zeros(len(points)), np.zeros(len(points))
+    for k, own in zip(rems, share, strict=True):
+        ray = points - references.maps.centres[k]
+        far = distances(references.maps, int(k))[texel_of(ray, n)]
+        length = np.maximum(np.linalg.norm(ray, axis=1), 1e-30)[:, None]
+        shown = np.where(
+            far[:, None] > 0.0, references.maps.centres[k] + far[:, None] * ray / length - made.centre, ray
+        )
         sine = np.linalg.norm(np.cross(shown, directions), axis=1)
-        angle = np.degrees(np.arctan2(sine, np.einsum("ij,ij->i", shown, directions)))
-        sees = (far > 0.0) & (far >= (1.0 - SEEN_SLACK) * length) & ~known
-        best[sees], known[sees] = angle[sees], True
-    state = made.state.numpy()
-    best[state == local_map.TEXEL_SHADED] = 0.0  # where they are
-    return best[(state == local_map.TEXEL_SHADED) | (state == local_map.TEXEL_BLENDED) & known]
+        along = np.einsum("ij,ij->i", shown, directions)
+        angle += own * np.degrees(np.arctan2(sine, along))
+        other += own * ((far == 0.0) | (np.abs(np.hypot(sine, along) - true) > DEPTH_APART * true))
+    blended = np.isin(state, (local_map.TEXEL_BLENDED, local_map.TEXEL_MISSING))
+    still = state != local_map.TEXEL_SHADED
+    judged = blended & (true > 0.0)
+    return {
+        "degrees": angle[judged],
+        "shaded": 1.0 - float(still.mean()),
+        "sky": float(((state == local_map.TEXEL_SKY) != (true == 0.0))[still].mean()),
+        "other": float(other[judged].mean()) if judged.any() else 0.0,
+    }
+
+
+def weights(scene, made, maps, rems, settings) -> np.ndarray:
+    """What each of some reference maps has of each texel, float [rems, texels]: maps of one and of nothing are blended."""
+    n, found = made.local.resolution, []
+    lengths = np.linalg.norm(texel_directions(n).reshape(-1, 3), axis=1)
+    inverse = lengths / np.maximum(made.local.distance(0).reshape(-1), 1e-30)
+    inverse[made.state.numpy() == local_map.TEXEL_SKY] = 0.0
+    shape = (6, n, n)
+    mesh = local_mesh.DepthMesh(inverse.astype(np.float32).reshape(shape), made.local.triangle(0), np.ones(shape, bool))
+    distance = np.array([distances(maps, int(k)).reshape(6, maps.resolution, -1) for k in rems])
+    for k in range(len(rems)):
+        radiance = np.zeros((*distance.shape, 4), np.float32)
+        radiance[..., 3], radiance[k, ..., 0] = 1.0, 1.0
+        coded = environment_maps.stored_maps(scene, maps.centres[rems], maps.axes[rems], radiance, distance)
+        numbers, kept = np.arange(len(rems)), settings.replace(rem_missing="best")
+        blended, _, _ = local_map.blend_local_map(scene, made.centre, mesh, None, coded, numbers, kept, made.slack)
+        found.append(blended.radiance(0)[..., 0].reshape(-1))
+    return np.array(found)
+
+
+def distances(maps, k: int) -> np.ndarray:
+    """Of the texels of a map, 0 sky, float64."""
+    return maps.distance(k).reshape(-1).astype(np.float64)
 
 
 def texel_of(rays: np.ndarray, n: int) -> np.ndarray:
-    """Flat index of the texel that each ray falls into."""
+    """Flat index of the texel that each ray falls into; of no direction: some texel."""
+    rays = np.where((rays == 0.0).all(axis=1, keepdims=True), [1.0, 0.0, 0.0], rays)
     on_face = np.einsum("fij,nj->nfi", RADIANCE_AXES, rays)
     face = on_face[..., 2].argmax(axis=1)
     right, up, forward = on_face[np.arange(len(rays)), face].T

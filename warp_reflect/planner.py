@@ -387,18 +387,31 @@ def make_plan(
     return made
 
 
+def _field_effect(scene: Scene, row: PlanRow) -> Effect:
+    """Whether a local map's depths are those of a field, and why."""
+    settings = row.settings
+    if settings.local_rays == "exact":
+        return Effect(False, "rays through the triangles, local_rays=exact")
+    if row.reflector.part not in scene.moving_parts:
+        return Effect(False, "the field holds what never moves, this mirror too; rays through the triangles")
+    cell = f"cells of {settings.field_cell:g} (field_cell)" if settings.field_cell else "automatic cells (field_cell=0)"
+    told = f"depths from the field of what never moves, field_kind={settings.field_kind}, {cell}, local_rays=field"
+    return Effect(True, told, {"cell": settings.field_cell})
+
+
 def _with_detail(scene, camera, settings, rows: list[PlanRow], earlier: Plan | None, costs) -> list[PlanRow]:
     """The rows with the resolution of their local maps, and why."""
     mapped = [row for row in rows if row.technique == "layered_environment" and row.pixels]
     for row in rows:
         seen = "only local maps have one" if row.pixels else "not seen from the camera"
-        row.effects["detail"] = row.effects["kept_map"] = Effect(False, seen)
+        row.effects["detail"] = row.effects["kept_map"] = row.effects["field"] = Effect(False, seen)
     for row in mapped:
         kept = settings.local_keep_px
         told = f"while what it holds has shifted by less than {kept:g} texels in the mean (local_keep_px)"
         row.effects["kept_map"] = Effect(
             kept > 0.0, told if kept > 0.0 else "made anew where it moves, local_keep_px=0"
         )
+        row.effects["field"] = _field_effect(scene, row)
     if not (settings.local_detail or settings.local_texels) or settings.max_error_px or settings.budget_ms:
         asked = settings.max_error_px or settings.budget_ms
         why = "a request for an error or a time decides" if asked else "local_detail=0, local_texels=0"

@@ -63,6 +63,7 @@ OCCLUSIONS = ("exact", "painter")
 SWITCHED = ("shadows", "dome_shadows")  # settings that take a boolean for on and off
 SWITCHES = {"1": "on", "true": "on", "on": "on", "0": "off", "false": "off", "off": "off"}
 REM_TEXELS = ("packed", "full")
+LOCAL_RAYS = ("exact", "field")
 REM_MISSING = ("shade", "best")
 ENVIRONMENT_UPDATES = ("static", "frame", "previous")
 FIELDS = ("auto", "heightfield", "occupancy")
@@ -133,6 +134,9 @@ class Settings:
     """Reference maps that are placed at most where the stage names no places."""
     rem_error_px: float = 1.0
     """Reference maps are placed until their predicted error is below this. [texels of a local map]"""
+    local_rays: str = "exact"
+    """Depths of local maps: `exact` (rays through the triangles, at the nodes of a mesh), or `field` (the field of what never
+    moves, `field_kind`)."""
     mesh_cells: int = 32
     """Cells along a face of a local map's mesh before it is refined, at least."""
     depth_ratio: float = 0.25
@@ -250,6 +254,7 @@ class Settings:
         _require(0.0 <= self.rem_blur_px <= 1.0e6, "rem_blur_px", self.rem_blur_px, "0 (off) or a number of texels")
         _require(1 <= self.rem_limit <= 1024, "rem_limit", self.rem_limit, "1 to 1024")
         _require(0.0 <= self.rem_error_px <= 1.0e6, "rem_error_px", self.rem_error_px, "a number of texels")
+        _require(self.local_rays in LOCAL_RAYS, "local_rays", self.local_rays, f"one of {', '.join(LOCAL_RAYS)}")
         _require(1 <= self.mesh_cells <= 4096, "mesh_cells", self.mesh_cells, "1 to 4096")
         _require(0.0 <= self.depth_ratio <= 1.0e6, "depth_ratio", self.depth_ratio, "0 (all texels) or a ratio")
         _require(0 <= self.parallax_steps <= 64, "parallax_steps", self.parallax_steps, "0 to 64")

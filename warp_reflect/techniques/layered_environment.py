@@ -24,8 +24,9 @@ from warp_reflect.scene import Note, Scene, SceneView
 from warp_reflect.settings import Settings, Status, Technique
 from warp_reflect.shade import LightView
 from warp_reflect.shapes import TriangleHit, clamp_weights, intersect_triangle, unit
-from warp_reflect.techniques import local_map, local_movers, reference_maps
+from warp_reflect.techniques import local_map, local_mesh, local_movers, reference_maps
 from warp_reflect.techniques.environment import Shown, centre_of, onward_of
+from warp_reflect.techniques.local_mesh import DepthMesh
 from warp_reflect.techniques.local_movers import moving_in
 from warp_reflect.techniques.reference_maps import ReferenceMaps
 
@@ -36,7 +37,7 @@ SKY = wp.constant(int(Status.SKY))
 HIDDEN = wp.constant(int(Status.HIDDEN))
 MAX_ITERATIONS = wp.constant(int(Status.MAX_ITERATIONS))
 MISSING = wp.constant(local_map.TEXEL_MISSING)
-KEY = "local maps"
+KEY, FIELD_KEY = "local maps", "field of local maps"
 PLANE_STEPS = wp.constant(3)  # from texel to texel; walls settle in one or two
 CANDIDATES_PER_MAP = 2  # maps that are looked at for each that is blended, where more than two are
 
@@ -47,8 +48,9 @@ class Prepared:
 
     Attributes:
         state: Of its texels, see `local_map.blend_local_map`.
-        cells: Of its depths' adaptive mesh, see `local_map.DepthMesh`.
+        cells: Of its depths' adaptive mesh, see `local_mesh.DepthMesh`.
         movers: Parts that move and that it may show.
+        slack: Length by which its depths may be off.
     """
 
     part: int
@@ -58,6 +60,7 @@ class Prepared:
     state: wp.array
     cells: np.ndarray
     movers: tuple[int, ...] = ()
+    slack: float = 0.0
     statistics: dict = field(default_factory=dict)
     timings: dict = field(default_factory=dict)
 
@@ -121,22 +124,38 @@ def _still_map(scene: Scene, part: int, settings: Settings) -> Prepared:
         centre = centre_of(scene, part)
         start = perf_counter()
         intersect = intersect_still(scene, part, centre, settings.threads)
-        mesh = local_map.trace_depth_mesh(
-            settings.local_edge,
-            intersect,
-            settings.mesh_cells,
-            settings.depth_ratio,
-            scene.device,
-            settings.threads,
-        )
+        mesh, slack = _depths(scene, part, centre, intersect, settings)
         traced = perf_counter()
         rems = nearest_maps(references, centre, settings.rem_count)
-        made = local_map.blend_local_map(scene, centre, mesh, intersect, references.maps, rems, settings)
+        made = local_map.blend_local_map(scene, centre, mesh, intersect, references.maps, rems, settings, slack)
         local, state, statistics = made
         timings = {"local_rays": 1e3 * (traced - start), "local_blend": 1e3 * (perf_counter() - traced)}
         statistics = mesh.statistics | statistics
-        scene.environments[key] = Prepared(part, centre, references, local, state, mesh.cells, (), statistics, timings)
+        scene.environments[key] = Prepared(
+            part, centre, references, local, state, mesh.cells, (), slack, statistics, timings
+        )
     return scene.environments[key]
+
+
+def _depths(scene: Scene, part: int, centre: np.ndarray, intersect, settings: Settings) -> tuple[DepthMesh, float]:
+    """What is around a mirror's centre, and the length by which that may be off."""
+    n, cells, ratio, device, threads = (
+        settings.local_edge,
+        settings.mesh_cells,
+        settings.depth_ratio,
+        scene.device,
+        settings.threads,
+    )
+    slack = 0.0
+    # A field holds what never moves: the body of a mirror that stands still would be around its own centre.
+    if settings.local_rays == "field" and part in scene.moving_parts:
+        from warp_reflect.techniques import local_field
+
+        known = local_field.local_field(scene, settings)
+        mesh = None if known is None else local_field.depths(scene, known, centre, n, cells, ratio, threads)
+        if mesh is not None:
+            return mesh, known.field.cell
+    return local_mesh.trace_depth_mesh(n, intersect, cells, ratio, device, threads), slack
 
 
 def take_over(earlier: Scene, scene: Scene) -> None:
@@ -148,6 +167,10 @@ def take_over(earlier: Scene, scene: Scene) -> None:
     reference_maps.take_over(earlier, scene)
     if earlier is scene or not reference_maps.same_numbers(earlier, scene):
         return
+    if any(key[0] == FIELD_KEY for key in earlier.environments):
+        from warp_reflect.techniques import local_field
+
+        local_field.take_over(earlier, scene)
     for key, known in earlier.environments.items():
         if key[0] != KEY or key in scene.environments or key[2].local_keep_px == 0.0:
             continue
@@ -183,7 +206,7 @@ def _onward_of_still_maps(scene: Scene, parts: set[int], settings: Settings) -> 
     return mirror_maps.of_maps(scene, {k: _still_map(scene, k, settings).local for k in mirrors}, settings.threads)
 
 
-def intersect_still(scene: Scene, part: int, centre: np.ndarray, threads: int) -> local_map.Intersect:
+def intersect_still(scene: Scene, part: int, centre: np.ndarray, threads: int) -> local_mesh.Intersect:
     """Rays from a mirror's centre through the BVH of what never moves, the mirror itself left out: exact."""
     tracer = scene.still_tracer
     origin = centre - tracer.origin

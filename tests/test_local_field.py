@@ -1,0 +1,118 @@
+"""Local maps out of fields: swept depths against rays through the same field, planes against the triangles, what has no field."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import street
+import warp as wp
+from stage_samples import saved
+from test_layered_environment import plan_of
+
+import warp_reflect as wr
+from warp_reflect.cubemap import texel_directions
+from warp_reflect.scene import Scene
+from warp_reflect.techniques import layered_environment, local_field
+
+SETTINGS = wr.Settings(
+    environment_resolution=32, local_rays="field", field_cell=0.25, field_kind="heightfield", bounces=1
+)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return wr.load_stage(saved(street.street(tmp_path_factory.mktemp("street") / "street.usda", walker=True)), time=1.0)
+
+
+def ball(scene) -> int:
+    return next(k for k in scene.moving_parts if scene.parts[k].prim_path.endswith("Ball"))
+
+
+def unit_directions(edge: int) -> np.ndarray:
+    directions = texel_directions(edge).reshape(-1, 3)
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize("up", ["Y", "Z"])
+@pytest.mark.parametrize("edge", [32, 33])
+def test_swept_depths_are_those_of_rays_through_the_field(scene, up, edge):
+    turned = Scene(dataclasses.replace(scene.data, up_axis=up), "cpu")
+    known = local_field.local_field(turned, SETTINGS)
+    assert known.field.kind == "heightfield"
+    low = turned.host_points.min(axis=0)
+    directions = unit_directions(edge)
+    asked = 0
+    rng = np.random.default_rng(4)
+    for _ in range(12):
+        at = low + rng.uniform(0.05, 0.95, 3) * (turned.host_points.max(axis=0) - low)
+        mesh = local_field.sweep(turned, known, turned.origin + at, edge, 1)
+        origins = wp.array(np.tile(at, (len(directions), 1)).astype(np.float32), dtype=wp.vec3)
+        trace = known.field.intersect(origins, wp.array(directions.astype(np.float32), dtype=wp.vec3), 1)
+        if mesh is None:
+            assert (trace.status.numpy() == wr.Status.INSIDE).any()
+            continue
+        asked += 1
+        length = np.linalg.norm(texel_directions(edge).reshape(-1, 3), axis=1)
+        met = trace.t.numpy() > 0
+        expected = np.where(met, length / np.maximum(trace.t.numpy(), 1e-9), 0.0)
+        off = np.abs(mesh.inverse.reshape(-1) - expected) > 1e-4 * np.maximum(expected, 1e-3)
+        assert off.mean() < 0.002 and ((mesh.triangle.reshape(-1) >= 0) == (mesh.inverse.reshape(-1) > 0)).all()
+    assert asked >= 4
+
+
+def test_a_place_in_a_house_or_beyond_the_columns_has_no_field(scene):
+    known = local_field.local_field(scene, SETTINGS)
+    house = next(part for part in scene.parts if part.prim_path.endswith("House0L"))
+    own = scene.host_triangles[house.first_triangle : house.first_triangle + house.triangle_count]
+    middle = scene.host_points[own.reshape(-1)].astype(np.float64).mean(axis=0) + scene.origin
+    for place in (middle, middle + [1e4, 0, 0], middle + [0, 0, -1e9]):
+        assert local_field.depths(scene, known, place, 16, 4, 0.25, 1) is None
+    above = local_field.depths(scene, known, middle + [0, 50, 0], 16, 4, 0.25, 1)
+    assert np.isfinite(above.inverse).all() and (above.inverse > 0).any()
+
+
+@pytest.mark.parametrize("kind", ["heightfield", "occupancy"])
+def test_depths_of_a_field_are_those_of_the_triangles_but_at_edges(scene, kind):
+    settings = SETTINGS.replace(field_kind=kind)
+    part = ball(scene)
+    exact, found = (
+        layered_environment._still_map(scene, part, each) for each in (settings.replace(local_rays="exact"), settings)
+    )
+    assert exact.slack == 0.0 and found.slack == pytest.approx(0.25)
+    true, got = (each.local.distance(0).reshape(-1).astype(np.float64) for each in (exact, found))
+    both = (true > 0) & (got > 0)
+    assert both.sum() > 0.95 * (true > 0).sum()
+    off = np.abs(got - true)[both] / true[both]
+    assert np.median(off) < 1e-3 and (off < 0.02).mean() > (0.85 if kind == "heightfield" else 0.75)
+
+
+def test_a_mirror_shows_the_same_by_a_field(scene):
+    exact = wr.render_frame(scene, plan_of(scene, shadows="off"))
+    plan = plan_of(scene, local_rays="field", field_cell=0.25, shadows="off")
+    row = plan.rows[0]
+    assert row.effects["field"].on and "local_rays=field" in row.effects["field"].reason
+    assert not plan_of(scene).rows[0].effects["field"].on
+    frame = wr.render_frame(scene, plan)
+    mirror = frame["reflectorId"] > 0
+    off = np.abs(frame["reflection"] - exact["reflection"])[mirror].max(-1)
+    assert np.isfinite(frame["RGBA"]).all() and off.mean() < 0.03 and np.median(off) < 0.005
+
+
+def test_fields_are_handed_over_in_time(scene):
+    known = local_field.local_field(scene, SETTINGS)
+    later = scene.at(3.0)
+    layered_environment.take_over(scene, later)
+    assert local_field.local_field(later, SETTINGS) is known and (later.origin != scene.origin).any()
+    part = ball(later)
+    exact, found = (
+        layered_environment._still_map(later, part, each) for each in (SETTINGS.replace(local_rays="exact"), SETTINGS)
+    )
+    true, got = (each.local.distance(0).reshape(-1).astype(np.float64) for each in (exact, found))
+    assert np.median(np.abs(got - true)[(true > 0) & (got > 0)]) < 1e-3
+
+
+def test_values_that_cannot_be_are_refused():
+    with pytest.raises(ValueError, match="local_rays"):
+        wr.Settings(local_rays="none")
