@@ -14,9 +14,10 @@ from warp_reflect import raster, reflector_maps, surface, vector
 from warp_reflect.layers import Camera, CameraView
 from warp_reflect.raster import make_target, rasterise
 from warp_reflect.scene import CameraData, InstanceData, LightData, MaterialData, Scene, SceneData
-from warp_reflect.techniques import map_search, quadric_patch, refine, reflector_map
+from warp_reflect.techniques import grid, map_search, quadric_patch, refine, reflector_map
+from warp_reflect.techniques.interpolation import ChunkView
 from warp_reflect.techniques.quadric_search import QuadricView
-from warp_reflect.techniques.vertices import SolveFrame, empty_vertices
+from warp_reflect.techniques.vertices import VERTEX_ARRAYS, SolveFrame, empty_vertices
 
 wp.set_module_options({"enable_backward": False})
 CPU = wp.get_device("cpu")
@@ -361,6 +362,46 @@ def test_maps_are_searched_as_the_plain_kernel_does(bodies_of_maps, name):
             np.testing.assert_array_equal(vectors[field], plain[field], err_msg=field)
         for field, values in searched_in_map(drawn_map, points, eye, "vector", 2, start, **knobs).items():
             np.testing.assert_array_equal(values, vectors[field], err_msg=field)
+
+
+@pytest.mark.parametrize("name", ["ellipsoid", "needle"])
+def test_vertices_step_from_directions_as_the_plain_kernel_has_them(bodies_of_maps, name):
+    """Cells of all sizes about the mirror, some hidden, some with corners behind it; answers that are there already."""
+    drawn_map, eye = bodies_of_maps[name], (2.5, 1.2, 1.7)
+    frame, camera = looking_at_origin(eye)
+    rng = np.random.default_rng(6)
+    cells, each = 40, 51  # vertices per cell: no multiple of the lanes
+    edge = rng.uniform(0.02, 2.0, cells)
+    low = rng.uniform(-3.0, 3.0, (cells, 3))
+    corners = low[:, None] + edge[:, None, None] * [[k & 1, k >> 1 & 1, k >> 2] for k in range(8)]
+    inside = low[:, None] + edge[:, None, None] * rng.uniform(0.0, 1.0, (cells, each, 3))
+    node = empty_vertices(8 * cells, CPU)
+    node.seed.assign(searched_in_map(drawn_map, corners.reshape(-1, 3).astype(np.float32), eye, "plain")["seed"])
+    chunks = ChunkView()
+    ranges = np.stack([np.arange(cells) * each, np.full(cells, each)], axis=1)
+    chunks.range = wp.array(ranges.astype(np.int32), dtype=wp.vec2i, device=CPU)
+    chunks.cell = wp.array(np.arange(cells, dtype=np.int32), dtype=int, device=CPU)
+    chunks.corner = wp.array(np.arange(8 * cells, dtype=np.int32).reshape(-1, 8), dtype=int, device=CPU)
+    chunks.low = wp.array(low.astype(np.float32), dtype=wp.vec3, device=CPU)
+    hidden = rng.random(cells) < 0.1
+    chunks.inv_edge = wp.array(np.where(hidden, 0.0, 1.0 / edge).astype(np.float32), dtype=float, device=CPU)
+    points = wp.array(inside.reshape(-1, 3).astype(np.float32), dtype=wp.vec3, device=CPU)
+    order = wp.array(rng.permutation(cells * each).astype(np.int32), dtype=int, device=CPU)
+    answered = rng.choice([0, 0, 0, 1, 3], cells * each).astype(np.uint8)
+    answers = {}
+    for kernels in ("plain", "vector"):
+        out, failed = (
+            empty_vertices(cells * each, CPU, with_position=True),
+            wp.zeros(cells * each, wp.uint8, device=CPU),
+        )
+        out.status.assign(answered)
+        given = [points, order, chunks, node, drawn_map.view, frame, camera, 2.0e-4, out, failed]
+        grid.step_from_directions(cells, given, CPU, 1, kernels)
+        answers[kernels] = [failed.numpy()] + [getattr(out, field).numpy() for field in VERTEX_ARRAYS[:-1]]
+    assert 30 < answers["plain"][0].sum() < 0.5 * cells * each
+    assert ((answers["plain"][2] == 1) & (answered == 0)).sum() > 200
+    for got, want, field in zip(answers["vector"], answers["plain"], ("failed", *VERTEX_ARRAYS), strict=False):
+        np.testing.assert_array_equal(got, want, err_msg=field)
 
 
 def test_rays_are_put_in_doubt_by_coarse_triangles_as_the_plain_kernel_does():

@@ -20,12 +20,13 @@ from enum import IntEnum
 import numpy as np
 import warp as wp
 
+from warp_reflect import vector
 from warp_reflect.launch import launch
 from warp_reflect.layers import Camera, CameraView
 from warp_reflect.reflector_maps import ReflectorMap
 from warp_reflect.scene import PartRange, Scene
 from warp_reflect.settings import Settings, Status
-from warp_reflect.techniques import octree
+from warp_reflect.techniques import interpolation_vector, octree
 from warp_reflect.techniques.interpolation import (
     NEAR,
     UNSAFE,
@@ -55,6 +56,7 @@ ORDERS = {"position": 2, "slope": 3, "direction": 4}  # of the error in a cell's
 # Directions from cells judged worse than this often miss ACCEPTED after their step, and would be solved after all.
 DIRECTION_PX = 0.25
 CHUNK = 64  # vertices per thread
+CHUNK_SPLIT_MIN = CHUNK  # a chunk is worth many elements of an ordinary launch
 
 
 @dataclass(frozen=True)
@@ -356,20 +358,32 @@ def _interpolate(scene, cells, descent, cell, map, frame, view, camera, settings
     chunks.low = wp.array(low.astype(np.float32), dtype=wp.vec3, device=device)
     chunks.inv_edge = wp.array(np.where(hidden, 0.0, 1.0 / edge).astype(np.float32), dtype=float, device=device)
     inputs = [cells.points, cells.order, chunks, descent.node]
-    # A chunk is worth many elements of an ordinary launch.
-    split_min = CHUNK
     if settings.grid_kind == "slope":
         inputs += [descent.slope, view, out_vertex]
-        launch(slope_position_kernel, len(owner), inputs, device, settings.threads, split_min=split_min)
+        launch(slope_position_kernel, len(owner), inputs, device, settings.threads, split_min=CHUNK_SPLIT_MIN)
         return np.zeros(0, np.int32)
     if settings.grid_kind == "position":
-        launch(position_kernel, len(owner), [*inputs, view, out_vertex], device, settings.threads, split_min=split_min)
+        launch(
+            position_kernel,
+            len(owner),
+            [*inputs, view, out_vertex],
+            device,
+            settings.threads,
+            split_min=CHUNK_SPLIT_MIN,
+        )
         return np.zeros(0, np.int32)
     tolerance = settings.grid_error_px / max(camera.fx, camera.fy) if settings.grid_error_px > 0.0 else 1.0
     failed = wp.zeros(len(cells.vertices), dtype=wp.uint8, device=device)
     inputs += [map.view, frame, view, tolerance, out_vertex, failed]
-    launch(direction_kernel, len(owner), inputs, device, settings.threads, split_min=split_min)
+    step_from_directions(len(owner), inputs, device, settings.threads, settings.kernels)
     return np.flatnonzero(failed.numpy()).astype(np.int32)
+
+
+def step_from_directions(chunk_count: int, inputs: list, device, threads: int, kernels: str) -> None:
+    """Run `interpolation.direction_kernel` or its vector form; `inputs` are its arguments, `out_failed` all zero."""
+    lanes = vector.chosen(kernels, device)
+    kernel = interpolation_vector.direction_lanes_kernel if lanes else direction_kernel
+    launch(kernel, chunk_count, inputs, device, threads, split_min=CHUNK_SPLIT_MIN)
 
 
 def _ranges(first: np.ndarray, count: np.ndarray) -> np.ndarray:
