@@ -181,8 +181,8 @@ def whole(scene: Scene, part: PartRange) -> VirtualMesh:
 
 def edge_middles(scene: Scene, ids: np.ndarray) -> np.ndarray:
     """Middles of the edges of scene triangles, float32 [3 len(ids), 3], edge by edge (v0v1, v1v2, v2v0)."""
-    corner = scene.host_points[scene.host_triangles[ids]]
-    return (0.5 * (corner + corner[:, [1, 2, 0]])).transpose(1, 0, 2).reshape(-1, 3)
+    corner = [scene.host_points[each] for each in scene.host_triangles[ids].T]
+    return np.concatenate([0.5 * (corner[k] + corner[(k + 1) % 3]) for k in range(3)])
 
 
 def measured_cuts(
@@ -207,15 +207,18 @@ def measured_cuts(
         tolerance_px: Deviation allowed. [pixels]
         unit_per_scene: Of the mirror's unit frame, in which it is about 1 in radius.
     """
-    corner = scene.host_points[scene.host_triangles[ids]].astype(np.float64)
-    longest = np.linalg.norm(corner - corner[:, [1, 2, 0]], axis=2).max(axis=1) * unit_per_scene
-    screen = vertices.screen.numpy()[scene.host_triangles[ids]][..., :3].astype(np.float64)
-    middle = middles.screen.numpy()[..., :3].reshape(3, len(ids), 3).astype(np.float64).transpose(1, 0, 2)
-    seen = (screen[..., 2] > 0.0).all(axis=1) & (middle[..., 2] > 0.0).all(axis=1)
-    along = screen[:, [1, 2, 0], :2] - screen[..., :2]
-    off = middle[..., :2] - screen[..., :2]
-    length = np.maximum(np.linalg.norm(along, axis=2), 1.0)
-    deviation = (np.abs(along[..., 0] * off[..., 1] - along[..., 1] * off[..., 0]) / length).max(axis=1)
+    longest = _longest_edges(scene, ids) * unit_per_scene
+    screen, middle = vertices.screen.numpy(), middles.screen.numpy().reshape(3, len(ids), 4)
+    corner = [screen[each] for each in scene.host_triangles[ids].T]
+    seen, deviation = np.ones(len(ids), bool), np.zeros(len(ids))
+    for k in range(3):
+        # Edge by edge and coordinate by coordinate: sums and maxima over axes of three are slow.
+        start, end, between = corner[k].astype(np.float64), corner[(k + 1) % 3], middle[k]
+        along_x, along_y = end[:, 0] - start[:, 0], end[:, 1] - start[:, 1]
+        off_x, off_y = between[:, 0] - start[:, 0], between[:, 1] - start[:, 1]
+        length = np.maximum(np.sqrt(along_x * along_x + along_y * along_y), 1.0)
+        deviation = np.maximum(deviation, np.abs(along_x * off_y - along_y * off_x) / length)
+        seen &= (start[:, 2] > 0.0) & (between[:, 2] > 0.0)
     wanted = np.sqrt(np.maximum(deviation / tolerance_px, 1.0))
     pieces = 2.0 ** np.ceil(np.log2(np.maximum(wanted, longest / MEASURED_LENGTH)))
     return np.minimum(np.where(seen, pieces, STRADDLING_MAX), estimate).astype(np.uint8)
@@ -234,19 +237,30 @@ def coarse_triangles(
     Returns:
         int32, the largest first.
     """
-    corner = scene.host_triangles
-    points = scene.host_points[corner].astype(np.float64)
-    longest = np.linalg.norm(points - points[:, [1, 2, 0]], axis=2).max(axis=1) * unit_per_scene / cuts
-    partly = (vertices.status.numpy()[corner] != int(Status.CONVERGED)).any(axis=1)
+    unsolved = vertices.status.numpy() != int(Status.CONVERGED)
+    first, second, third = (unsolved[each] for each in scene.host_triangles.T)
+    partly = first | second | third
     if len(ids):
-        unseen = middles.screen.numpy()[:, 2].reshape(3, len(ids)) <= 0.0
-        partly[ids] |= unseen.any(axis=0)
+        first, second, third = middles.screen.numpy()[:, 2].reshape(3, len(ids)) <= 0.0
+        partly[ids] |= first | second | third
     partly[part.first_triangle : part.first_triangle + part.triangle_count] = False
     seen = scene.seen_in(part)
     if seen is not None:
         partly &= seen
-    found = np.flatnonzero(partly & (longest > COARSE_SHARE))
-    return found[np.argsort(-longest[found], kind="stable")][:COARSE_MAX].astype(np.int32)
+    partly = np.flatnonzero(partly)
+    longest = _longest_edges(scene, partly) * unit_per_scene / cuts[partly]
+    found, longest = partly[longest > COARSE_SHARE], longest[longest > COARSE_SHARE]
+    return found[np.argsort(-longest, kind="stable")][:COARSE_MAX].astype(np.int32)
+
+
+def _longest_edges(scene: Scene, ids: np.ndarray) -> np.ndarray:
+    """Lengths of the longest edges of scene triangles in scene units, float64 [len(ids)]."""
+    corner = [scene.host_points[each].astype(np.float64) for each in scene.host_triangles[ids].T]
+    square = np.zeros(len(ids))
+    for k in range(3):
+        edge = corner[k] - corner[(k + 1) % 3]
+        square = np.maximum(square, np.einsum("ij,ij->i", edge, edge))
+    return np.sqrt(square)
 
 
 def triangle_cost(cuts: np.ndarray) -> float:
@@ -274,7 +288,8 @@ def cut_mesh(scene: Scene, part: PartRange, cuts: np.ndarray, estimated: np.ndar
         ids = np.flatnonzero(cuts == pieces)
         weights, lattice = _lattice(int(pieces))
         corner = scene.host_points[scene.host_triangles[ids]]
-        points.append(np.einsum("lk,tkj->tlj", weights, corner).reshape(-1, 3).astype(np.float32))
+        lattice_points = corner.transpose(0, 2, 1).reshape(-1, 3) @ weights.T
+        points.append(lattice_points.reshape(len(ids), 3, -1).transpose(0, 2, 1).reshape(-1, 3).astype(np.float32))
         first = count + np.arange(len(ids)) * len(weights)
         triangles.append((lattice[None] + first[:, None, None]).reshape(-1, 3))
         parents.append(np.repeat(ids, len(lattice)))
