@@ -11,12 +11,13 @@ reflection is any technique's, and only reflectors are followed, what is merely 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from functools import cached_property
 
 import numpy as np
 import warp as wp
 
 from warp_reflect import bvh, launch, shade
-from warp_reflect.layers import GBuffer, MirrorPixels, ReflectionLayer, Reflector, add_statistics
+from warp_reflect.layers import GBuffer, MirrorPixels, ReflectionLayer, Reflector, add_statistics, meets
 from warp_reflect.normal_maps import prepare_normals
 from warp_reflect.scene import SHAPE_NONE, Scene, SceneView
 from warp_reflect.settings import Status, Technique
@@ -30,15 +31,29 @@ wp.set_module_options({"enable_backward": False})
 LEAST_WEIGHT = wp.constant(2.0e-3)
 
 
-def mirror_bodies(scene: Scene, reflectors: Iterable[Reflector]) -> wp.array:
-    """`bvh.OwnBody` of every patch of a scene, without triangles where it is no reflector's."""
-    # By columns: to make a structure for each of some thousand patches takes as long as a small picture.
-    bodies = np.zeros(len(scene.patch_shapes), bvh.OwnBody.numpy_dtype())
-    for reflector in reflectors:
-        body, patches = bvh.body_of(scene, reflector.part, reflector.convex), scene.parts[reflector.part].patches
-        for name in bodies.dtype.names:
-            bodies[name][list(patches)] = getattr(body, name)
-    return wp.array(bodies, dtype=bvh.OwnBody, device=scene.device)
+class Mirrors:
+    """The reflectors of a scene, patch by patch.
+
+    Attributes:
+        patches: bool [patches], whether each is a reflector's.
+    """
+
+    def __init__(self, scene: Scene, reflectors: Iterable[Reflector]):
+        self._scene, self._reflectors = scene, list(reflectors)
+        self.patches = np.zeros(len(scene.patch_shapes), bool)
+        for reflector in self._reflectors:
+            self.patches[list(scene.parts[reflector.part].patches)] = True
+
+    @cached_property
+    def bodies(self) -> wp.array:
+        """`bvh.OwnBody` of every patch, without triangles where it is no reflector's."""
+        # By columns: to make a structure for each of some thousand patches takes as long as a small picture.
+        scene, bodies = self._scene, np.zeros(len(self.patches), bvh.OwnBody.numpy_dtype())
+        for reflector in self._reflectors:
+            body, patches = bvh.body_of(scene, reflector.part, reflector.convex), scene.parts[reflector.part].patches
+            for name in bodies.dtype.names:
+                bodies[name][list(patches)] = getattr(body, name)
+        return wp.array(bodies, dtype=bvh.OwnBody, device=scene.device)
 
 
 @wp.kernel
@@ -121,7 +136,7 @@ def add_bounce_kernel(
 def onward(
     scene: Scene,
     gbuffer: GBuffer,
-    bodies: wp.array,
+    mirrors: Mirrors,
     layer: ReflectionLayer,
     seen: wp.array,
     met: Callable[[ReflectionLayer], wp.array],
@@ -134,7 +149,7 @@ def onward(
     Args:
         scene: On the G-buffer's device; its BVH is built if this is the first use.
         gbuffer: What the eye sees.
-        bodies: From `mirror_bodies`.
+        mirrors: Of the scene.
         layer: Rays and what they met.
         seen: vec3 [n], radiance of that, mirrors showing the domes; not written to.
         met: The same of other rays.
@@ -146,7 +161,9 @@ def onward(
         vec3 [n]; `seen` itself where no mirror is met. The layer's statistics get `bounced`: rays followed, and
         `bounce_limit`: those whose mirror shows the domes as `bounces` ended there.
     """
-    device = scene.device
+    if not meets(scene, layer, mirrors.patches):
+        return seen
+    device, bodies = scene.device, mirrors.bodies
     index = np.arange(layer.pixels.count, dtype=np.int32)
     weight = wp.full(layer.pixels.count, wp.vec3(1.0, 1.0, 1.0), dtype=wp.vec3, device=device)
     first, total = layer, seen

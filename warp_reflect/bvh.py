@@ -428,6 +428,8 @@ def trace_onward_kernel(
     normal: wp.array(dtype=wp.vec3),
     direction: wp.array(dtype=wp.vec3),
     inside: wp.array(dtype=wp.uint8),
+    index: wp.array(dtype=int),
+    indexed: int,
     # Outputs:
     out_triangle: wp.array(dtype=int),
     out_u: wp.array(dtype=float),
@@ -435,8 +437,10 @@ def trace_onward_kernel(
     out_distance: wp.array(dtype=float),
     out_status: wp.array(dtype=wp.uint8),
 ):
-    """One thread per ray."""
+    """One thread per asked ray."""
     i = first + wp.tid()
+    if indexed != 0:
+        i = index[i]
     hit = trace_onward(mesh_id, scene, point[i], direction[i], normal[i], facet[i], int(inside[i]), 0.0)
     out_triangle[i] = hit.triangle
     out_u[i] = hit.u
@@ -604,7 +608,12 @@ def trace_pixels(
 
 
 def trace_transmitted(
-    scene: Scene, layer: ReflectionLayer, facet: wp.array, inside: wp.array, threads: int = 0
+    scene: Scene,
+    layer: ReflectionLayer,
+    facet: wp.array,
+    inside: wp.array,
+    threads: int = 0,
+    index: wp.array | None = None,
 ) -> None:
     """Follow rays that have gone through a surface and write their hits into the layer.
 
@@ -615,11 +624,14 @@ def trace_transmitted(
         facet: int32 [n], the triangle that each ray starts on.
         inside: uint8 [n], 1 where the ray is in the body of its facet.
         threads: CPU threads; 0: one per core.
+        index: int32, which of the rays, each at most once; None: all.
     """
     pixels = layer.pixels
+    count = pixels.count if index is None else len(index)
     inputs = [wp.uint64(scene.tracer.id), scene.view, facet, pixels.point, pixels.normal, pixels.direction, inside]
+    inputs += [facet if index is None else index, int(index is not None)]
     outputs = [layer.triangle, layer.u, layer.v, layer.distance, layer.status]
-    launch.launch(trace_onward_kernel, pixels.count, inputs + outputs, scene.device, threads, split_min=TRACE_SPLIT_MIN)
+    launch.launch(trace_onward_kernel, count, inputs + outputs, scene.device, threads, split_min=TRACE_SPLIT_MIN)
     if scene.has_hole is not None:
         _past_holes(scene, layer, scene.tracer, facet, inside=inside, threads=threads)
 

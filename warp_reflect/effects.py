@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from warp_reflect.layers import Camera
 from warp_reflect.scene import FinishData, MaterialData, PartRange, Scene
 from warp_reflect.settings import Settings
-from warp_reflect.techniques import MAPS, planar
+from warp_reflect.techniques import MAPS, planar, refraction_image
 
 # The effects of mirrors that are finishes, in the order in which they are applied, and the module of `finishes` of each.
 FINISHES: dict[str, str] = {
@@ -135,6 +135,34 @@ def pane_effects(
         "frost": _frost(material, finish, settings, camera),
         "frost_fade": _frost_fade(finish),
     }
+
+
+def refraction_effect(
+    scene: Scene, part: int, interface: str, pixels: int, settings: Settings, camera: Camera, method: str
+) -> Effect:
+    """Whether what lies behind a surface is drawn as the eye sees it through that, instead of traced.
+
+    Args:
+        scene, part: The surface, index into `scene.parts`.
+        interface: "thin" or "solid".
+        pixels: At which the plan's camera sees it.
+        settings, camera: The plan's.
+        method: The plan's; the reference traces.
+    """
+    if interface != "solid":
+        return Effect(False, "thin: nothing is bent")
+    if not pixels:
+        return Effect(False, "not seen from the camera")
+    if method == "reference":
+        return Effect(False, "the reference: every ray is traced")
+    if settings.refraction == "traced":
+        return Effect(False, "refraction=traced")
+    if camera.orthographic:
+        return Effect(False, "a parallel camera's rays are traced")
+    drawn, reason, numbers = refraction_image.applies(scene, part, pixels)
+    if settings.refraction == "drawn" and numbers:
+        return Effect(True, "refraction=drawn", numbers)
+    return Effect(drawn, f"{reason} (refraction={settings.refraction})", numbers)
 
 
 def moves_with_time(effects: dict[str, Effect]) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import os
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 import warp as wp
@@ -29,7 +29,7 @@ from warp_reflect.layers import NO_REFLECTOR, Camera, GBuffer, MirrorPixels, Ref
 from warp_reflect.planner import PaneRow, Plan, PlanRow, find_camera, keep_pace
 from warp_reflect.scene import Scene
 from warp_reflect.settings import Settings, Technique
-from warp_reflect.techniques import MAPS, TECHNIQUES
+from warp_reflect.techniques import MAPS, TECHNIQUES, refraction_image
 from warp_reflect.timing import StageTimer
 from warp_reflect.virtual_objects import virtual_objects
 
@@ -44,8 +44,8 @@ class Frame:
         gbuffer: What the eye sees.
         layers: Reflector id to its `ReflectionLayer`.
         transmitted: Part of a transparent surface to what the eye sees through it.
-        statistics: Counts over all reflectors: pixels settled by `candidate`, `walk`, `empty`, `bvh`; vertices; ...; the
-            largest bounds: `reused_px`.
+        statistics: Counts over all reflectors and what is seen through surfaces: pixels settled by `candidate`, `walk`,
+            `empty`, `bvh`; vertices; ...; the largest bounds: `reused_px`.
         timings: Milliseconds per stage.
         kept: Ids of the reflectors whose layer is the previous frame's own, as nothing had moved.
     """
@@ -385,7 +385,7 @@ def _met(
     if not left:
         return plain
     solved = {row.reflector.id for row in plan.rows if row.effects["second_bounce"].numbers.get("solved")}
-    bodies = bounces.mirror_bodies(scene, [row.reflector for row in plan.rows])
+    mirrors = bounces.Mirrors(scene, [row.reflector for row in plan.rows])
 
     def reflected(layer: ReflectionLayer) -> wp.array:
         radiance = plain(layer)
@@ -400,7 +400,7 @@ def _met(
         forward, reflector = None, layer.pixels.reflector
         if reflector in solved and layer is layers.get(reflector):  # not where a finish turned its rays
             forward = mirrored_eyes.answers(scene, shown.gbuffer, plan, reflector)
-        ask = (scene, shown.gbuffer, bodies, layer, radiance, reflected, follow, settings.threads, forward)
+        ask = (scene, shown.gbuffer, mirrors, layer, radiance, reflected, follow, settings.threads, forward)
         return bounces.onward(*ask)
 
     return met
@@ -427,7 +427,10 @@ def _look_through(
     for pane in plan.panes:
         if pane.part not in pixels:
             continue
-        found = transmission.look_through(scene, shown, interfaces, pixels[pane.part], settings)
+        follow = None
+        if pane.effects["refraction_image"].on:
+            follow = partial(refraction_image.follow, scene, shown.gbuffer, pane.part, settings=pane.settings)
+        found = transmission.look_through(scene, shown, interfaces, pixels[pane.part], settings, follow=follow)
         radiance = transmission.through_radiance(scene, through, found, settings)
         for name, home in PANE_FINISHES.items():
             if pane.effects[name].on:

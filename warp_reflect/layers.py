@@ -307,6 +307,13 @@ class ReflectionLayer:
         )
 
 
+def meets(scene: Scene, layer: ReflectionLayer, patches: np.ndarray) -> bool:
+    """Whether any ray of a layer meets one of the patches, bool [patches of the scene]."""
+    triangle = layer.triangle.numpy()
+    met = scene.host_triangle_patch.take(triangle, mode="clip")
+    return bool((patches.take(met) & (triangle >= 0)).any())
+
+
 def add_statistics(total: dict, statistics: dict) -> None:
     """Add a layer's statistics to a total: counts add up, bounds (names that end in `_px`) are the largest."""
     for name, value in statistics.items():

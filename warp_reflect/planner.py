@@ -20,7 +20,7 @@ from warp_reflect import (
 )
 from warp_reflect.applicable import PREFERRED
 from warp_reflect.budget import BUILT_IN, Costs, fixed_ms, loss, predict
-from warp_reflect.effects import Effect, bounce_effect, finish_effects, pane_effects
+from warp_reflect.effects import Effect, bounce_effect, finish_effects, pane_effects, refraction_effect
 from warp_reflect.launch import thread_count
 from warp_reflect.layers import Camera, Reflector
 from warp_reflect.lighting import LightRow, needs_probe, plan_lights, shadows_of
@@ -376,7 +376,7 @@ def make_plan(
             bounce = Effect(True, bounce.reason + "".join(how), bounce.numbers | {"solved": solved})
         row.effects["second_bounce"] = bounce
         row.effects["shadows"] = _shadows(lights, visible)
-    panes = [_pane(scene, view, settings, k, pixels[k]) for k in clear]
+    panes = [_pane(scene, view, settings, method, k, pixels[k]) for k in clear]
     notes += _too_rough(scene, settings)
     if settings.kernels != "plain" and not scene.device.is_cuda and vector.missing():
         notes.append(Note("", f"plain kernels only: {vector.missing()} (kernels={settings.kernels})"))
@@ -570,10 +570,11 @@ def _row(scene, camera, settings, method, number, part_index, part, weight, pixe
     )
 
 
-def _pane(scene, camera, settings, part_index, pixels) -> PaneRow:
+def _pane(scene, camera, settings, method, part_index, pixels) -> PaneRow:
     part = scene.parts[part_index]
     interface, reason = transmission.interface_of(scene, part_index)
     effects = pane_effects(scene, part, interface, reason, pixels, settings, camera)
+    effects["refraction_image"] = refraction_effect(scene, part_index, interface, pixels, settings, camera, method)
     return PaneRow(part_index, part.prim_path, part.subset, part.instance, interface, pixels, effects, settings)
 
 

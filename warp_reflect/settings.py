@@ -57,6 +57,7 @@ class Technique(IntEnum):
 
 
 SEARCHES = ("newton", "midpoint")
+REFRACTIONS = ("auto", "drawn", "traced")
 GRID_KINDS = ("direction", "slope", "position")
 REFINEMENTS = ("exact", "strict", "off")
 OCCLUSIONS = ("exact", "painter")
@@ -157,6 +158,9 @@ class Settings:
     """`low`, `medium`, `high`, `veryhigh`: subdivision level 0-3, and the tessellation of gprims, as in usdrecord."""
     bounces: int = 2
     """Mirrors seen in mirrors, in mirrors ...: how many reflections are followed; beyond them a mirror shows the dome."""
+    refraction: str = "auto"
+    """What lies behind a flat refracting surface: `traced` by rays, `drawn` as its virtual image and refined, `auto` what is
+    predicted to be cheaper; the same hits either way."""
     transparency_depth: int = 8
     """Transparent surfaces behind one another that are looked through; nothing is seen through the next."""
     fade_distance: float = 0.0
@@ -246,6 +250,7 @@ class Settings:
         _require(
             update in ENVIRONMENT_UPDATES, "environment_update", update, f"one of {', '.join(ENVIRONMENT_UPDATES)}"
         )
+        _require(self.refraction in REFRACTIONS, "refraction", self.refraction, f"one of {', '.join(REFRACTIONS)}")
         depth = self.transparency_depth
         _require(0 <= depth <= 64, "transparency_depth", depth, "0 to 64 surfaces")
         _require(1 <= self.rem_count <= 8, "rem_count", self.rem_count, "1 to 8")

@@ -34,6 +34,7 @@ from warp_reflect.layers import (
     ReflectionLayer,
     add_statistics,
     eye_ray_direction,
+    meets,
 )
 from warp_reflect.normal_maps import prepare_normals
 from warp_reflect.optics import PI, dielectric_reflectance, refract, tangent_basis
@@ -160,20 +161,20 @@ def make_interfaces(scene: Scene, finishes: Mapping[int, FinishData]) -> Interfa
         scene: The scene.
         finishes: Transparent part to what is asked of it; one that is not to be frosted has frost 0.
     """
-    opaque = InterfaceView()
-    views = [opaque] * len(scene.patch_shapes)
+    # By columns, see `bounces.Mirrors`.
+    views = np.zeros(len(scene.patch_shapes), InterfaceView.numpy_dtype())
+    clear = np.zeros(len(scene.patch_shapes), bool)
     for index, finish in finishes.items():
         kind, _ = interface_of(scene, index)
         part = scene.parts[index]
-        for patch in part.patches:
-            view = views[patch] = InterfaceView()
-            view.kind = KINDS.index(kind)
-            view.ior = scene.data.materials[part.material].ior
-            view.spread = math.tan(math.radians(finish.frost))
-            view.fade = 1.0 / finish.frost_distance if finish.frost_distance > 0.0 else 0.0
-            view.fade_color = wp.vec3(*finish.frost_color)
+        own = list(part.patches)
+        views["kind"][own] = KINDS.index(kind)
+        views["ior"][own] = scene.data.materials[part.material].ior
+        views["spread"][own] = math.tan(math.radians(finish.frost))
+        views["fade"][own] = 1.0 / finish.frost_distance if finish.frost_distance > 0.0 else 0.0
+        views["fade_color"][own] = finish.frost_color
+        clear[own] = True
     fades = any(finish.frost_distance > 0.0 for finish in finishes.values())
-    clear = np.array([view is not opaque for view in views], bool)
     return Interfaces(wp.array(views, dtype=InterfaceView, device=scene.device), clear, fades)
 
 
@@ -544,6 +545,7 @@ def look_through(
     settings: Settings,
     sample: tuple[int, int] = (0, 0),
     wavy: bool = False,
+    follow: Callable[[ReflectionLayer, wp.array, wp.array], None] | None = None,
 ) -> Transmission:
     """The rays behind a transparent surface that the eye sees, and the first thing that each meets.
 
@@ -555,6 +557,7 @@ def look_through(
         settings: Threads, kernels.
         sample: (k, n): ray k of n of the cone into which a frosted surface scatters; (0, 0): its middle.
         wavy: Rays are bent at the normals of `shown`, waves included; otherwise only those that leave a body are.
+        follow: (layer, facet, inside) -> None, finds what rays meet first, as `bvh.trace_transmitted` does; None: that does.
     """
     device, threads, gbuffer, n = scene.device, settings.threads, shown.gbuffer, surface.count
     normal, direction, weight = (wp.empty(n, dtype=wp.vec3, device=device) for _ in range(3))
@@ -571,7 +574,10 @@ def look_through(
         launch.launch(cross_seen_kernel, n, [scene.view, *inputs, *outputs], device, threads)
     pixels = MirrorPixels(NO_REFLECTOR, surface.pixel, surface.point, normal, direction, surface.box)
     layer = ReflectionLayer.empty(pixels, Technique.RAYTRACED, device)
-    bvh.trace_transmitted(scene, layer, facet, inside, threads)
+    if follow is not None:
+        follow(layer, facet, inside)
+    else:
+        bvh.trace_transmitted(scene, layer, facet, inside, threads)
     return Transmission(surface, layer, weight, inside, wp.zeros(n, dtype=float, device=device))
 
 
@@ -617,7 +623,7 @@ def behind(
     """
     device, threads = scene.device, settings.threads
     count = layer.pixels.count
-    if not _meets_transparent(scene, interfaces, layer):
+    if not meets(scene, layer, interfaces.clear):
         if patches is None and nearness is None:
             return seen
         total = wp.empty(count, dtype=wp.vec3, device=device) if patches is not None else seen
@@ -682,11 +688,6 @@ def behind(
     if near is not None:
         launch.launch(mean_nearness_kernel, count, [near, nearness], device, threads)
     return total
-
-
-def _meets_transparent(scene: Scene, interfaces: Interfaces, layer: ReflectionLayer) -> bool:
-    triangle = layer.triangle.numpy()
-    return bool(interfaces.clear[scene.host_triangle_patch[triangle[triangle >= 0]]].any())
 
 
 def add_to_picture(picture: wp.array, transmission: Transmission, radiance: wp.array, threads: int = 0) -> None:

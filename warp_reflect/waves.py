@@ -62,8 +62,8 @@ def turn_sine(turns: float) -> float:
     return t * (SINE_1 + square * (SINE_3 + square * SINE_5))
 
 
-def waves_of(scene: Scene, part: PartRange, finish: FinishData) -> list[Wave]:
-    """The waves of a flat part at the scene's time."""
+def waves_of(scene: Scene, part: PartRange, finish: FinishData) -> np.ndarray:
+    """The waves of a flat part at the scene's time, `Wave` [WAVE_COUNT]."""
     data = scene.data
     seconds = (data.time or 0.0) / data.time_codes_per_second
     first, across = _axes(_normal(scene, part))
@@ -75,14 +75,10 @@ def waves_of(scene: Scene, part: PartRange, finish: FinishData) -> list[Wave]:
     # Whole turns are taken off in float64: neither a late time nor a far origin may cost digits.
     turns = (way @ scene.origin - np.mod(speed * seconds, length)) / length
     phase = np.mod(turns + GOLDEN * (number + 1) ** 2, 1.0)
-    waves = []
-    for j in number:
-        wave = Wave()
-        wave.turns = 1.0 / length[j]
-        wave.way, wave.phase = wp.vec3(*way[j]), float(phase[j])
-        # The mean square of a sine is 1/2 of its largest.
-        wave.slope = finish.wave_slope * math.sqrt(2.0 / WAVE_COUNT)
-        waves.append(wave)
+    waves = np.zeros(WAVE_COUNT, Wave.numpy_dtype())
+    # The mean square of a sine is 1/2 of its largest.
+    waves["slope"] = finish.wave_slope * math.sqrt(2.0 / WAVE_COUNT)
+    waves["way"], waves["turns"], waves["phase"] = way, 1.0 / length, phase
     return waves
 
 

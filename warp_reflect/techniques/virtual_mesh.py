@@ -286,7 +286,7 @@ def cut_mesh(scene: Scene, part: PartRange, cuts: np.ndarray, estimated: np.ndar
     count = scene.vertex_count
     for pieces in np.unique(cuts[cuts > 1]):
         ids = np.flatnonzero(cuts == pieces)
-        weights, lattice = _lattice(int(pieces))
+        weights, lattice = lattice_of(int(pieces))
         corner = scene.host_points[scene.host_triangles[ids]]
         lattice_points = corner.transpose(0, 2, 1).reshape(-1, 3) @ weights.T
         points.append(lattice_points.reshape(len(ids), 3, -1).transpose(0, 2, 1).reshape(-1, 3).astype(np.float32))
@@ -311,7 +311,7 @@ def cut_mesh(scene: Scene, part: PartRange, cuts: np.ndarray, estimated: np.ndar
 
 
 @cache
-def _lattice(pieces: int) -> tuple[np.ndarray, np.ndarray]:
+def lattice_of(pieces: int) -> tuple[np.ndarray, np.ndarray]:
     """(corner weights [vertex_count, 3], triangles [pieces^2, 3]) of a triangle cut into pieces along each edge."""
     row, column = np.meshgrid(np.arange(pieces + 1), np.arange(pieces + 1), indexing="ij")
     inside = row + column <= pieces
