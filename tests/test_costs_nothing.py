@@ -12,7 +12,7 @@ import pytest
 from rooms import CHROME, placed, plane_room, render, room, sphere
 
 import warp_reflect as wr
-from warp_reflect import effects, launch, sweep
+from warp_reflect import effects, kernels, launch, sweep
 from warp_reflect.scene import FinishData, LightData, MaterialData, MirrorData, Scene
 from warp_reflect.techniques import TECHNIQUES
 
@@ -117,7 +117,8 @@ CASES = {
         twin={"mirror": MaterialData(transmission=1.0, roughness=0.0)},
     ),
 }
-TEXTURED = {"normal_map"}  # its case takes a picture: test_bumps.py
+# Their cases take a picture, a stage that moves, a pool: test_bumps.py, test_local_field.py, test_refraction_image.py.
+ELSEWHERE = {"normal_map", "field", "refraction_image"}
 # Effects that launch no kernel of their own: they choose an argument of those that run anyway, or the frame they begin at.
 ARGUMENTS = {"collection", "warm_start", "refraction", "frost_fade", "detail", "kept_map"}
 
@@ -151,6 +152,11 @@ def test_effect_launches_and_holds_nothing_unless_a_frame_calls_for_it(effect, d
     off = dataclasses.replace(on, **on.twin)
     without, still = drawn(off, device)
     assert not owned(on, still)
+    for frame, modules in ((with_it, launched), (without, still)):
+        assert set(kernels.of_plan(frame.plan)) <= modules, "compiled ahead, and never launched"
+        assert set(kernels.of_eye(frame.plan.settings, device)) <= modules | {"vector"}
+    if effect in {*kernels.ROWS, "shadows", "transparency", "refinement"}:
+        assert owned(on, kernels.of_plan(with_it.plan))
     if on.holds is not None:
         assert on.holds(with_it) > 0 and not on.holds(without)
 
@@ -159,7 +165,7 @@ def test_every_technique_and_effect_has_its_case(device):
     plans = [drawn(CASES[effect], device)[0].plan for effect in ("shadows", "transparency")]
     (row,), (light,), (pane,) = plans[0].rows, plans[0].lights, plans[1].panes
     named = {*TECHNIQUES, *effects.FINISHES, *effects.PANE_FINISHES, *row.effects, *light.effects, *pane.effects}
-    assert named <= CASES.keys() | ARGUMENTS | TEXTURED, named - CASES.keys()
+    assert named <= CASES.keys() | ARGUMENTS | ELSEWHERE, named - CASES.keys()
 
 
 def test_collection_that_is_not_there_builds_no_structure_of_its_own(device):
@@ -180,7 +186,7 @@ scene = room(sphere(), placed(0, 0, 0))
 found = {}
 for method in ("none", "reference"):
     frame = render(scene, method, size=(64, 36))
-    compiled = {key[0].name for key in launch._loaded}
+    compiled = {module.name for module, *_ in launch._loaded}
     found[method] = sorted(compiled), sorted(vars(scene)), len(frame.layers)
 print(json.dumps([found, [name for name in sys.modules if name.startswith("warp_reflect.finishes")]]))
 """

@@ -14,6 +14,7 @@ from warp_reflect import (
     __version__,
     bounces,
     images,
+    kernels,
     mirrored_eyes,
     motion,
     raster,
@@ -255,6 +256,8 @@ def render_frame(scene: Scene, plan: Plan, camera: str | Camera | None = None, p
         plan = keep_pace(plan, previous.plan, previous.spent)
     settings = plan.settings
     view = plan.camera if camera is None else find_camera(scene, camera, plan.size)
+    if previous is None:
+        kernels.begin(kernels.of_plan(plan), scene.device)
     gbuffer, layers = reflect_scene(scene, plan, view, timer, previous)
     kept = _kept(layers, previous)
     same_layers = previous and gbuffer is previous.gbuffer and len(kept) == len(layers)

@@ -10,8 +10,9 @@ bit-equal at any number of threads.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+import threading
+from collections.abc import Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache, partial
 from time import perf_counter
@@ -35,12 +36,12 @@ FINITE_FLAGS = (
 
 
 _recordings: list[list[tuple[str, int]]] = []
-_loaded: set[tuple] = set()
+_loaded: dict[tuple, Future] = {}
 _loading = [0.0]
 
 
 def loading_ms() -> float:
-    """Milliseconds that this process has spent on loading and compiling kernels, since it began."""
+    """Milliseconds that this process has waited for kernels to be compiled and loaded, since it began."""
     return 1000.0 * _loading[0]
 
 
@@ -129,17 +130,49 @@ def launch_bands(kernel, ranges: list[tuple[int, int]], bands: list[tuple[int, i
     run_parallel([partial(draw, band) for band in bands])
 
 
+def ready(modules: Iterable[wp.Module], device) -> list[Future]:
+    """Begin to compile and load kernel modules for a CPU, several at a time; a launch waits for its own."""
+    return [_begun(module, wp.get_device(device)) for module in modules]
+
+
 def _load(kernel, device) -> None:
-    # The module must be compiled and loaded before threads race for it. With the block size of a CPU launch: it is
-    # part of the module's identity, and another one would compile everything a second time.
+    # The module must be compiled and loaded before threads race for it.
     device = wp.get_device(device)
-    key = kernel.module, str(device)
-    if key in _loaded or not device.is_cpu:
+    if not device.is_cpu:
         return
-    start = perf_counter()
-    kernel.module.load(device, CPU_BLOCK_DIM)
-    _loading[0] += perf_counter() - start
-    _loaded.add(key)
+    loading = _begun(kernel.module, device)
+    if not loading.done():
+        start = perf_counter()
+        loading.exception()
+        _loading[0] += perf_counter() - start
+    loading.result()
+
+
+def _begun(module: wp.Module, device: wp.Device) -> Future:
+    # A process that was forked has none of its parent's threads: it begins anew, with what is loaded already.
+    key = module, str(device), os.getpid()
+    if key not in _loaded:
+        pool = _compilers(module.options["cpu_compiler_flags"] or "", os.getpid())
+        _loaded[key] = pool.submit(_compile, module, device)
+    return _loaded[key]
+
+
+@cache
+def _compilers(flags: str, process: int) -> ThreadPoolExecutor:
+    """Threads that compile with the same flags.
+
+    Each thread keeps the precompiled header of Warp's own code for its flags, which costs as much as a module or two: so
+    threads are not shared between flags, and with two kinds of flags half of the cores are for either.
+    """
+    return ThreadPoolExecutor(max(1, thread_count("cpu") // 2), thread_name_prefix="warp_reflect_compile")
+
+
+def _compile(module: wp.Module, device: wp.Device) -> None:
+    # Not begun where the program is at its end, which waits for these threads.
+    if threading.main_thread().is_alive():
+        # With the block size of a CPU launch: it is part of the module's identity, and another one would compile
+        # everything a second time.
+        module.load(device, CPU_BLOCK_DIM)
 
 
 def run_parallel(jobs: list) -> None:

@@ -28,7 +28,7 @@ from pathlib import Path
 import numpy as np
 
 import warp_reflect as wr
-from warp_reflect import images, seen
+from warp_reflect import images, kernels, seen
 from warp_reflect.progress import Report, statistics_line
 from warp_reflect.realised import realised_error
 
@@ -166,6 +166,9 @@ class OpenJob:
     def __init__(self, job: Job, place: int = 0):
         self.job = job
         self.plan: wr.Plan | None = None
+        if os.path.exists(job.stage):
+            device = job.load.get("device", "cpu")
+            kernels.begin(kernels.of_eye(job.settings, device), device)
         self._scene = wr.load_stage(job.stage, time=job.times[place], **job.load)
         self._last: tuple[float | None, wr.Frame] | None = None
 

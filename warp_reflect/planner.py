@@ -13,6 +13,7 @@ from warp_reflect import (
     calibration,
     choice,
     detail,
+    kernels,
     mirrored_eyes,
     raster,
     transmission,
@@ -537,8 +538,11 @@ def _look(
     casting = needs_probe(scene, settings)
     if not scene.triangle_count or not (mirrors or panes or casting):
         return dict.fromkeys([*mirrors, *panes], 0), None
+    kernels.begin(kernels.of_preview(settings, scene.device, casting), scene.device)
     small = preview(scene, camera, settings.threads, settings.kernels)
     pixels = small.pixels_of(scene, [*mirrors, *panes])
+    if casting and any(pixels[k] for k in mirrors):
+        kernels.begin(kernels.of_preview(settings, scene.device, casting, True), scene.device)
     seen = [k for k in mirrors if pixels[k] >= max(settings.few_pixels, 1)]
     facing = settings.bounces > 1 and (len(mirrors) > 1 or any(not scene.body(k).convex for k in seen))
     if not (casting or facing):

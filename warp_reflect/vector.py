@@ -14,7 +14,7 @@ from functools import cache
 
 import warp as wp
 
-from warp_reflect.launch import CPU_BLOCK_DIM, launch
+from warp_reflect.launch import launch
 
 wp.set_module_options({"enable_backward": False})
 
@@ -212,7 +212,6 @@ def probe_kernel(first: int, out: wp.array(dtype=float)):
 def missing() -> str:
     """Why vector kernels cannot run on this machine's CPU; empty where they can. Compiles a small one to find out."""
     try:
-        probe_kernel.module.load(wp.get_device("cpu"), CPU_BLOCK_DIM)
         out = wp.zeros(BLOCK, dtype=float, device="cpu")
         launch(probe_kernel, 1, [out], "cpu", 1)
         values = out.numpy()

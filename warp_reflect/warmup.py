@@ -40,7 +40,7 @@ def warm_all(device: wp.DeviceLike, threads: int = 0) -> tuple[list[str], float]
 
     Args:
         device: Where they are to run.
-        threads: Modules compiled at a time; 0: one per core.
+        threads: Modules compiled at a time for CUDA; 0: one per core.
 
     Returns:
         (names of the modules, seconds).
@@ -52,8 +52,11 @@ def warm_all(device: wp.DeviceLike, threads: int = 0) -> tuple[list[str], float]
     for name in names:
         importlib.import_module(name)
         modules.append(wp.get_module(name))
-    block = launch.CPU_BLOCK_DIM if device.is_cpu else None
-    wp.force_load(device, modules, block, launch.thread_count("cpu", threads))
+    if device.is_cpu:
+        for loading in launch.ready(modules, device):
+            loading.result()
+    else:
+        wp.force_load(device, modules, max_workers=launch.thread_count("cpu", threads))
     return names, perf_counter() - start
 
 
