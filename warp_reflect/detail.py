@@ -7,6 +7,7 @@ Differs from it by: the map's resolution follows as well; levels change only wel
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -18,6 +19,9 @@ from warp_reflect.scene import Scene
 from warp_reflect.settings import Settings
 
 LEAST = 8  # texels along an edge: fewer show no more than a colour for each side
+# Texels for each pixel that a mirror is seen at, at most: a ball in full view gets 8 by its size, one that hides behind others
+# shows little of its map.
+SEEN_TEXELS = 16.0
 HYSTERESIS = 0.2  # of a level's texels: a size has to be so far beyond before another level is taken
 
 
@@ -44,23 +48,28 @@ def size_px(scene: Scene, camera: Camera, part: int) -> float:
     return most if depth * most <= diameter * camera.fx else diameter * camera.fx / depth
 
 
-def details(sizes: Mapping[int, float], settings: Settings, before: Mapping[int, int]) -> dict[int, Detail]:
+def details(
+    sizes: Mapping[int, float], settings: Settings, before: Mapping[int, int], pixels: Mapping[int, int] | None = None
+) -> dict[int, Detail]:
     """The resolution of every mirror's local map.
 
     Args:
         sizes: Reflector id to `size_px`.
         settings: `local_detail`, `local_texels`; full detail is `local_edge`.
         before: Reflector id to the resolution of the frame before, where there was one.
+        pixels: Reflector id to the pixels at which it is seen; None: nothing hides it.
     """
-    full = settings.local_edge
-    chosen = {id: _level(settings.local_detail * size, full, before.get(id)) for id, size in sizes.items()}
+    full, seen = settings.local_edge, {} if pixels is None else pixels
+    most = {id: math.sqrt(SEEN_TEXELS * seen[id] / FACE_COUNT) if id in seen else math.inf for id in sizes}
+    wanted = {id: min(settings.local_detail * size, most[id]) for id, size in sizes.items()}
+    chosen = {id: _level(wanted[id], full, before.get(id)) for id in sizes}
     asked = dict(chosen)
     while 0 < settings.local_texels < _texels(chosen):
         finest = max(chosen, key=lambda id: (chosen[id] > LEAST, chosen[id] / max(sizes[id], 1.0e-30), id))
         if chosen[finest] <= LEAST:
             break
         chosen[finest] = max(chosen[finest] // 2, LEAST)
-    return {id: _told(chosen[id], asked[id], sizes[id], before.get(id), settings) for id in sizes}
+    return {id: _told(chosen[id], asked[id], sizes[id], before.get(id), settings, most[id]) for id in sizes}
 
 
 def _level(wanted: float, full: int, before: int | None) -> int:
@@ -81,10 +90,12 @@ def _texels(chosen: Mapping[int, int]) -> int:
     return sum(FACE_COUNT * resolution * resolution for resolution in chosen.values())
 
 
-def _told(resolution: int, asked: int, size: float, before: int | None, settings: Settings) -> Detail:
+def _told(resolution: int, asked: int, size: float, before: int | None, settings: Settings, most: float) -> Detail:
     reason = f"{size:.0f} px on screen at local_detail={settings.local_detail:g} ask for {asked} texels an edge"
     if settings.local_detail == 0.0:
         reason = f"{asked} texels an edge, local_detail=0"
+    elif most < settings.local_detail * size:
+        reason = f"{size:.0f} px on screen, hidden but for pixels that ask for {asked} texels an edge"
     elif before == asked:
         reason += ", as before"
     if resolution < asked:

@@ -465,7 +465,9 @@ def _look(scene: Scene, plan: Plan, view: Camera, timer: StageTimer) -> tuple[GB
     """What the eye sees, and the pixels of every mirror."""
     threads = plan.settings.threads
     with timer("raster"):
-        gbuffer = raster.draw_scene(scene, view, threads, kernels=plan.settings.kernels)
+        gbuffer = plan.take_picture(view)
+        if gbuffer is None:
+            gbuffer = raster.draw_scene(scene, view, threads, kernels=plan.settings.kernels)
     with timer("mirror_pixels"):
         pixels, gbuffer.reflector_id = surface.mirror_pixels(
             scene, gbuffer, _mirrors(plan), threads, plan.settings.kernels

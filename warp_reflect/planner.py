@@ -23,7 +23,7 @@ from warp_reflect.applicable import PREFERRED
 from warp_reflect.budget import BUILT_IN, Costs, fixed_ms, loss, predict
 from warp_reflect.effects import Effect, bounce_effect, finish_effects, pane_effects, refraction_effect
 from warp_reflect.launch import thread_count
-from warp_reflect.layers import Camera, Reflector
+from warp_reflect.layers import Camera, GBuffer, Reflector
 from warp_reflect.lighting import LightRow, needs_probe, plan_lights, shadows_of
 from warp_reflect.probe import Probe, preview, probe
 from warp_reflect.reflectors import mirror_roughness, mirror_weight
@@ -119,6 +119,7 @@ class Plan:
     _prepared: dict[int, object] = field(default_factory=dict)
     _prepared_in_mirrors: dict[tuple[int, str], object] = field(default_factory=dict)
     _ways: dict[int, list[choice.Option]] = field(default_factory=dict)
+    _picture: GBuffer | None = None  # what the plan's camera sees, drawn to decide: the first frame's
     _told: int = 0  # of the notes, the last: those of the request for an error or a time
 
     @property
@@ -180,6 +181,12 @@ class Plan:
             technique = TECHNIQUES[row.technique]
             self._prepared[row.reflector.id] = technique.prepare(self.scene, row.reflector, row.settings)
         return self._prepared[row.reflector.id]
+
+    def take_picture(self, view: Camera) -> GBuffer | None:
+        """What a camera sees of the plan's scene, where that was drawn to decide; for one frame, which completes it."""
+        picture, self._picture = self._picture, None
+        same = picture is not None and picture.camera.sees_as(view)
+        return dataclasses.replace(picture, camera=view) if same else None
 
     def at(self, scene: Scene, last: Plan | None = None) -> Plan:
         """The plan for its stage at another time: decided anew, with its own camera there.
@@ -356,7 +363,7 @@ def make_plan(
     weights = _weights(scene, settings) if method != "none" else {}
     found = [(k, part, weight) for k, part in enumerate(scene.parts) if (weight := weights.get(part.material, 0.0))]
     clear = [k for k, part in enumerate(scene.parts) if transmission.is_transparent(scene, part)]
-    pixels, tried = _look(scene, view, [k for k, _, _ in found], clear, settings)
+    pixels, tried, picture = _look(scene, view, [k for k, _, _ in found], clear, settings)
     lights = plan_lights(scene, tried, settings, costs)
     # What techniques draw themselves is shadowed where the picture is.
     cast = shadows_of(lights, settings)
@@ -378,11 +385,11 @@ def make_plan(
         row.effects["second_bounce"] = bounce
         row.effects["shadows"] = _shadows(lights, visible)
     panes = [_pane(scene, view, settings, method, k, pixels[k]) for k in clear]
-    notes += _too_rough(scene, settings)
+    notes += _too_rough(scene, settings, weights)
     if settings.kernels != "plain" and not scene.device.is_cuda and vector.missing():
         notes.append(Note("", f"plain kernels only: {vector.missing()} (kernels={settings.kernels})"))
     rows = _with_detail(scene, view, settings, rows, earlier, costs)
-    made = Plan(scene, view, settings, method, rows, panes, notes, lights, costs)
+    made = Plan(scene, view, settings, method, rows, panes, notes, lights, costs, _picture=picture)
     _fit(made, choice.Pace() if earlier is None else earlier.pace)
     _take_over(made, earlier)
     return made
@@ -422,7 +429,7 @@ def _with_detail(scene, camera, settings, rows: list[PlanRow], earlier: Plan | N
     sizes = {row.reflector.id: detail.size_px(scene, camera, row.reflector.part) for row in mapped}
     known = earlier.rows if earlier is not None and earlier.settings == settings else []
     before = {row.reflector.id: row.settings.local_edge for row in known if row.effects["detail"].on}
-    found, made = detail.details(sizes, settings, before), []
+    found, made = detail.details(sizes, settings, before, {row.reflector.id: row.pixels for row in mapped}), []
     for row in rows:
         if row.reflector.id in found:
             level = found[row.reflector.id]
@@ -434,13 +441,16 @@ def _with_detail(scene, camera, settings, rows: list[PlanRow], earlier: Plan | N
     return made
 
 
-def _too_rough(scene: Scene, settings: Settings) -> list[Note]:
+def _too_rough(scene: Scene, settings: Settings, weights: dict[int, float]) -> list[Note]:
     """A note for each material that would be a mirror if it were smoother."""
-    smooth, now = _weights(scene, settings.replace(reflector_max_roughness=1.0)), _weights(scene, settings)
-    notes = []
+    smoother, notes = settings.replace(reflector_max_roughness=1.0), []
+    one_of: dict[int, PartRange] = {}
     for part in scene.parts:
-        if smooth[part.material] and not now[part.material]:
-            material = scene.data.materials[part.material]
+        one_of.setdefault(part.material, part)
+    for number, part in one_of.items():
+        material = scene.data.materials[number]
+        rougher = mirror_roughness(material) > settings.reflector_max_roughness
+        if rougher and not weights.get(number, 0.0) and mirror_weight(scene, part, smoother):
             text = f"roughness {mirror_roughness(material):.3g} > {settings.reflector_max_roughness:g}"
             text += " (reflector_max_roughness): no mirror; what it reflects is scattered"
             notes.append(Note(material.path or part.prim_path, text))
@@ -533,21 +543,21 @@ def find_camera(scene: Scene, camera: str | Camera | None, size: tuple[int, int]
 
 def _look(
     scene: Scene, camera: Camera, mirrors: list[int], panes: list[int], settings: Settings
-) -> tuple[dict[int, int], Probe | None]:
-    """(pixels that show each part; the points that lights and bounces are decided by, None where nothing is decided)."""
+) -> tuple[dict[int, int], Probe | None, GBuffer | None]:
+    """(pixels of each part; what lights and bounces are decided by, if they are; the whole picture, if it was drawn)."""
     casting = needs_probe(scene, settings)
     if not scene.triangle_count or not (mirrors or panes or casting):
-        return dict.fromkeys([*mirrors, *panes], 0), None
+        return dict.fromkeys([*mirrors, *panes], 0), None, None
     kernels.begin(kernels.of_preview(settings, scene.device, casting), scene.device)
     small = preview(scene, camera, settings.threads, settings.kernels)
-    pixels = small.pixels_of(scene, [*mirrors, *panes])
+    pixels, picture = small.pixels_of(scene, [*mirrors, *panes]), small.gbuffer if small.scale == 1.0 else None
     if casting and any(pixels[k] for k in mirrors):
         kernels.begin(kernels.of_preview(settings, scene.device, casting, True), scene.device)
     seen = [k for k in mirrors if pixels[k] >= max(settings.few_pixels, 1)]
     facing = settings.bounces > 1 and (len(mirrors) > 1 or any(not scene.body(k).convex for k in seen))
     if not (casting or facing):
-        return pixels, None
-    return pixels, probe(scene, small, mirrors, settings.threads, settings.kernels)
+        return pixels, None, picture
+    return pixels, probe(scene, small, mirrors, settings.threads, settings.kernels), picture
 
 
 def _row(scene, camera, settings, method, number, part_index, part, weight, pixels, notes, costs) -> PlanRow:

@@ -15,6 +15,9 @@ from warp_reflect.scene import Scene
 from warp_reflect.settings import Technique
 
 PREVIEW_SIDE = 320  # pixels; enough to count a mirror's pixels within a few per cent for the choice of technique
+# Pixels of the picture for each triangle of the scene, up to which drawing it whole costs little more than drawing it small,
+# and the frame is spared it.
+WHOLE_PIXELS = 4
 STRIDE = 3  # pixels of the preview from one point to the next; odd, so that it falls in step with few patterns
 
 
@@ -25,10 +28,12 @@ class Preview:
     Attributes:
         gbuffer: What is seen.
         scale: Pixels of the picture for each of the preview's.
+        stride: Pixels from one point that is tried to the next.
     """
 
     gbuffer: GBuffer
     scale: float
+    stride: int = STRIDE
 
     def pixels_of(self, scene: Scene, parts: list[int]) -> dict[int, int]:
         """Pixels of the picture that show each part."""
@@ -53,9 +58,11 @@ class Probe:
 
 
 def preview(scene: Scene, camera: Camera, threads: int = 0, kernels: str = "auto") -> Preview:
-    """Draw a scene small; `kernels` as in `Settings`."""
+    """Draw a scene small, or whole where that is as cheap; `kernels` as in `Settings`."""
     width, height = camera.size
-    shrink = max(1.0, max(width, height) / PREVIEW_SIDE)
+    shrink = smaller = max(1.0, max(width, height) / PREVIEW_SIDE)
+    if width * height <= WHOLE_PIXELS * scene.triangle_count:
+        shrink = 1.0
     small = dataclasses.replace(
         camera,
         size=(max(1, round(width / shrink)), max(1, round(height / shrink))),
@@ -65,11 +72,12 @@ def preview(scene: Scene, camera: Camera, threads: int = 0, kernels: str = "auto
         cy=camera.cy / shrink,
     )
     gbuffer = raster.draw_scene(scene, small, threads, kernels=kernels)
-    return Preview(gbuffer, width * height / (small.size[0] * small.size[1]))
+    stride = int(STRIDE * smaller / shrink) | 1
+    return Preview(gbuffer, width * height / (small.size[0] * small.size[1]), stride)
 
 
 def probe(scene: Scene, small: Preview, parts: list[int], threads: int = 0, kernels: str = "auto") -> Probe:
-    """Try every `STRIDE`-th point of a preview in both directions, and what mirrors show there.
+    """Try every `stride`-th point of a preview in both directions, and what mirrors show there.
 
     Args:
         scene: Its BVH is built if there are mirrors and this is the first use.
@@ -81,7 +89,7 @@ def probe(scene: Scene, small: Preview, parts: list[int], threads: int = 0, kern
     gbuffer = small.gbuffer
     width, height = gbuffer.camera.size
     row, column = np.divmod(np.arange(width * height), width)
-    chosen = (row % STRIDE == STRIDE // 2) & (column % STRIDE == STRIDE // 2)
+    chosen = (row % small.stride == small.stride // 2) & (column % small.stride == small.stride // 2)
     triangle = gbuffer.triangle.numpy()
     found = [_taken(points_of(scene, gbuffer, None, threads), np.flatnonzero(chosen & (triangle >= 0)))]
     count = float(np.count_nonzero(triangle >= 0))

@@ -332,6 +332,9 @@ def mirror_pixels(
 def _met(scene: Scene, gbuffer: GBuffer, reflector: int, pixel: np.ndarray, threads: int, kernels: str) -> MirrorPixels:
     """The surface at some pixels of the picture."""
     n, device = len(pixel), scene.device
+    if not n:
+        none = wp.empty(0, dtype=wp.vec3, device=device)
+        return MirrorPixels(reflector, wp.empty(0, dtype=int, device=device), none, none, none, (0, 0, 0, 0))
     mirror = MirrorPixels(
         reflector=reflector,
         pixel=wp.array(pixel, dtype=int, device=device),

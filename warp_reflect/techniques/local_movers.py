@@ -1,7 +1,8 @@
-"""What moves, drawn into a mirror's local map in a second pass: reference maps hold nothing of it.
+"""What moves, put into a mirror's local map in a second pass: reference maps hold nothing of it.
 
-Source: Meyer and Loscos 2003, section 6, where people walk through the reconstructed maps. Differs from it by: other moving
-mirrors are drawn as well, and show their own maps: those of what stands still, or those of the frame before
+Source: Meyer and Loscos 2003, section 6, where people walk through the reconstructed maps. Differs from it by: a ray for every
+texel through a tree over the moving triangles alone, no farther than to what the map holds, where they draw; other moving
+mirrors are met as well, and show their own maps: those of what stands still, or those of the frame before
 (`environment_update` "previous").
 """
 
@@ -13,35 +14,48 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from warp_reflect import raster
-from warp_reflect.cubemap import FACE_COUNT
-from warp_reflect.environment_maps import CubeMaps, Onward, copied_maps, face_camera, texel_hits
-from warp_reflect.layers import Camera
+from warp_reflect import launch
+from warp_reflect.cubemap import radiance_direction
+from warp_reflect.environment_maps import CubeMaps, Onward, copied_maps
+from warp_reflect.launch import FINITE_FLAGS
 from warp_reflect.scene import Scene
 from warp_reflect.settings import Settings
 from warp_reflect.techniques import local_map
 
+# Directions and centres are finite: those of texels, and of bodies.
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FINITE_FLAGS})
+
 KEY = "moving parts"
+FAR = wp.constant(3.0e38)
 
 
-@dataclass(frozen=True)
+@dataclass
 class Movers:
-    """The moving parts of a scene by themselves: drawing them costs nothing of the others.
+    """The moving triangles of a scene by themselves, with a tree over them.
 
     Attributes:
-        points: vec3, scene frame, float32.
-        triangles: vec3i [n], indices into `points`.
-        ids: Their numbers in the scene, int [n].
-        ranges: [first, end) of each moving part in `triangles`, by part.
-        low, high: Boxes of the parts, scene frame, float64 [3], by part.
+        mesh: Of them; triangles that are left out are shrunk to a point.
+        corners: Of its triangles, indices into its points, int32 [n, 3].
+        number: Of each in the scene, int [n].
+        part: Of each, index into the scene's parts, int [n].
+        without: The parts that are left out now.
     """
 
-    points: wp.array
-    triangles: wp.array
-    ids: wp.array
-    ranges: dict[int, tuple[int, int]]
-    low: dict[int, np.ndarray]
-    high: dict[int, np.ndarray]
+    mesh: wp.Mesh
+    corners: np.ndarray
+    number: np.ndarray
+    part: np.ndarray
+    without: frozenset[int] = frozenset()
+
+    def leave_out(self, parts: frozenset[int]) -> None:
+        """Fit the tree to all parts but some."""
+        if parts == self.without:
+            return
+        gone = np.isin(self.part, list(parts))
+        corners = np.where(gone[:, None], self.corners[:, :1], self.corners)
+        self.mesh.indices.assign(corners.reshape(-1))
+        self.mesh.refit()
+        self.without = parts
 
 
 def moving_in(scene: Scene, part: int) -> tuple[int, ...]:
@@ -52,6 +66,36 @@ def moving_in(scene: Scene, part: int) -> tuple[int, ...]:
         for k in scene.moving_parts
         if k != part and scene.parts[k].triangle_count and (seen is None or seen[scene.parts[k].first_triangle])
     )
+
+
+@wp.kernel
+def moving_texels_kernel(
+    first: int,
+    mesh_id: wp.uint64,
+    eye: wp.vec3,
+    resolution: int,
+    distance: wp.array(dtype=float),
+    # Outputs:
+    out_face: wp.array(dtype=int),
+    out_distance: wp.array(dtype=float),
+):
+    """One thread per texel: the moving triangle before what the map holds there, -1 none, and the distance to what is seen."""
+    i = first + wp.tid()
+    n = resolution
+    face = i / (n * n)
+    row = (i - face * n * n) / n
+    column = i - (face * n + row) * n
+    u = (2.0 * float(column) + 1.0) / float(n) - 1.0
+    v = (2.0 * float(row) + 1.0) / float(n) - 1.0
+    reach = distance[i]
+    query = wp.mesh_query_ray(
+        mesh_id, eye, wp.normalize(radiance_direction(face, u, v)), wp.where(reach > 0.0, reach, FAR)
+    )
+    out_face[i] = -1
+    out_distance[i] = reach
+    if query.result:
+        out_face[i] = query.face
+        out_distance[i] = query.t
 
 
 def draw_moving(
@@ -66,90 +110,49 @@ def draw_moving(
 
     Args:
         scene: Of the map.
-        local: A map of all else; it is not changed.
+        local: A map of all else, its faces along the axes of the world; it is not changed.
         state: Of its texels, see `local_map.blend_local_map`.
-        parts: What is drawn, see `moving_in`.
+        parts: What is met, see `moving_in`.
         onward: For the parts that are seen, what mirrors among them show; None: the domes.
         settings: `threads`, shadows.
 
     Returns:
         (The map; the state of its texels; statistics `local_moving`: texels that show what moves).
     """
-    movers = _movers(scene)
-    bits = (np.arange(8)[:, None] >> np.arange(3)) & 1
-    low, high = (np.array([box[part] for part in parts])[:, None] for box in (movers.low, movers.high))
-    corners = np.where(bits[None] == 1, high, low) - (local.centres[0] - scene.origin)
-    n, device = local.resolution, scene.device
+    movers, device = _movers(scene), scene.device
+    movers.leave_out(frozenset(scene.moving_parts) - frozenset(parts))
     made = copied_maps(local)
-    distance, triangle = local.view.distance.numpy().copy(), local.view.triangle.numpy().copy()
-    of_state = state.numpy().copy()
-    texels = []
-    for face in range(FACE_COUNT):
-        camera = face_camera(scene, local.centres[0], local.axes[0], face, n)
-        inside = np.array(parts)[_may_be_seen(corners, camera)]
-        if not len(inside):
-            continue
-        found, met = _draw(scene, movers, camera, inside, settings)
-        own = slice(face * n * n, (face + 1) * n * n)
-        nearer = (found >= 0) & ((distance[own] == 0.0) | (met < distance[own]))
-        distance[own], triangle[own] = np.where(nearer, met, distance[own]), np.where(nearer, found, triangle[own])
-        texels.append(face * n * n + np.flatnonzero(nearer))
-    shown = np.concatenate(texels) if texels else np.zeros(0, np.int64)
-    if len(shown):
-        made.view.distance = wp.array(distance, dtype=float, device=device)
-        made.view.triangle = wp.array(triangle, dtype=int, device=device)
-        patches = np.unique(scene.host_triangle_patch[triangle[shown]])
-        seen = {part for part in parts if np.isin(patches, list(scene.parts[part].patches)).any()}
-        local_map.shade_texels(scene, made, shown, settings, onward(seen))
-        of_state[shown] = local_map.TEXEL_SHADED
+    count = len(local.view.distance)
+    face = wp.empty(count, dtype=int, device=device)
+    made.view.distance = wp.empty(count, dtype=float, device=device)
+    eye = wp.vec3(*(local.centres[0] - scene.origin))
+    inputs = [wp.uint64(movers.mesh.id), eye, local.resolution, local.view.distance, face, made.view.distance]
+    launch.launch(moving_texels_kernel, count, inputs, device, settings.threads)
+    met = face.numpy()
+    shown = np.flatnonzero(met >= 0)
+    if not len(shown):
+        return made, state, {"local_moving": 0}
+    triangle, of_state = local.view.triangle.numpy().copy(), state.numpy().copy()
+    triangle[shown] = movers.number[met[shown]]
+    of_state[shown] = local_map.TEXEL_SHADED
+    made.view.triangle = wp.array(triangle, dtype=int, device=device)
+    seen = set(np.unique(movers.part[met[shown]]).tolist())
+    local_map.shade_texels(scene, made, shown, settings, onward(seen))
     return made, wp.array(of_state, dtype=wp.uint8, device=device), {"local_moving": len(shown)}
 
 
 def _movers(scene: Scene) -> Movers:
     if (KEY,) not in scene.environments:
-        ranges, ids = {}, []
-        first = 0
-        for k in scene.moving_parts:
-            part = scene.parts[k]
-            ranges[k] = (first, first + part.triangle_count)
-            first += part.triangle_count
-            ids.append(np.arange(part.first_triangle, part.first_triangle + part.triangle_count))
-        number = np.concatenate(ids)
-        used, local = np.unique(scene.host_triangles[number], return_inverse=True)
-        triangles, points = local.reshape(-1, 3), scene.host_points[used]
-        corners = {k: points[triangles[a:b]].astype(np.float64).reshape(-1, 3) for k, (a, b) in ranges.items() if b > a}
-        scene.environments[(KEY,)] = Movers(
-            wp.array(points, dtype=wp.vec3, device=scene.device),
-            wp.array(triangles.astype(np.int32), dtype=wp.vec3i, device=scene.device),
-            wp.array(number.astype(np.int32), dtype=int, device=scene.device),
-            ranges,
-            {k: corner.min(axis=0) for k, corner in corners.items()},
-            {k: corner.max(axis=0) for k, corner in corners.items()},
-        )
+        parts = [scene.parts[k] for k in scene.moving_parts]
+        number = np.concatenate([np.arange(p.first_triangle, p.first_triangle + p.triangle_count) for p in parts])
+        part = np.repeat(scene.moving_parts, [p.triangle_count for p in parts])
+        spans = dict.fromkeys((p.first_vertex, p.vertex_count) for p in parts)  # parts of one prim share its vertices
+        used = np.concatenate([np.arange(first, first + count) for first, count in spans])
+        place = np.zeros(scene.vertex_count, np.int32)
+        place[used] = np.arange(len(used), dtype=np.int32)
+        corners = place[scene.host_triangles[number]]
+        points = wp.array(scene.host_points[used], dtype=wp.vec3, device=scene.device)
+        indices = wp.array(corners.reshape(-1), dtype=wp.int32, device=scene.device)
+        mesh = wp.Mesh(points, indices, bvh_constructor="lbvh" if scene.device.is_cuda else "sah")
+        scene.environments[(KEY,)] = Movers(mesh, corners, number, part)
     return scene.environments[(KEY,)]
-
-
-def _may_be_seen(corners: np.ndarray, camera: Camera) -> np.ndarray:
-    """Which boxes are not wholly beyond one of the planes of a face's camera; corners from its eye, float64 [n, 8, 3]."""
-    x, y, depth = (corners @ axis for axis in (camera.right, camera.up, camera.forward))
-    beyond = (-depth, x - depth, -x - depth, y - depth, -y - depth)
-    return ~np.any([(plane > 0.0).all(axis=1) for plane in beyond], axis=0)
-
-
-def _draw(scene: Scene, movers: Movers, camera: Camera, parts, settings: Settings) -> tuple[np.ndarray, np.ndarray]:
-    """(triangle of the scene int [n n], -1 none; distance float32 likewise) of a face."""
-    drawn = [(movers.triangles[first:end], movers.ids[first:end]) for first, end in _joined(movers, parts)]
-    view = camera.view(scene)
-    gbuffer = raster.draw_triangles(camera, view, movers.points, drawn, settings.threads, settings.kernels)
-    _, distance = texel_hits(scene, gbuffer, settings.threads)
-    return gbuffer.triangle.numpy(), distance.numpy()
-
-
-def _joined(movers: Movers, parts) -> list[tuple[int, int]]:
-    """Ranges of triangles of some parts, ascending; those that follow each other are one."""
-    joined: list[tuple[int, int]] = []
-    for first, end in sorted(movers.ranges[part] for part in parts):
-        if joined and joined[-1][1] == first:
-            first = joined.pop()[0]
-        joined.append((first, end))
-    return joined
