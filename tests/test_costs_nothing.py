@@ -172,8 +172,8 @@ def test_collection_that_is_not_there_builds_no_structure_of_its_own(device):
     asks = dataclasses.replace(CHROME, mirror=MirrorData("/mirror", reflects=("/floor",)))
     with_it, _ = drawn(Case(mirror=asks), device)
     without, _ = drawn(Case(), device)
-    assert with_it.plan.rows[0].effects["collection"].on and with_it.scene._mirror_tracers
-    assert not without.plan.rows[0].effects["collection"].on and not without.scene._mirror_tracers
+    assert with_it.plan.rows[0].effects["collection"].on and with_it.scene.mirror_tracers
+    assert not without.plan.rows[0].effects["collection"].on and not without.scene.mirror_tracers
 
 
 PLAIN = """
