@@ -7,6 +7,8 @@ tested for here.
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import warp as wp
 
@@ -477,6 +479,30 @@ def trace_bounced_kernel(
     out_status[i] = wp.uint8(hit.status)
 
 
+class Fit:
+    """A structure that tracers of several times share: its tree is built once, and fitted to the points of who asks.
+
+    The tree follows from what stands still and from the shapes of what moves, each in a branch of its own, wherever that
+    stands: rays meet the same at a time whichever was looked at before.
+    """
+
+    def __init__(self, scene: Scene, indices: wp.array):
+        groups = np.zeros(scene.triangle_count, np.int32)
+        for part in (scene.parts[k] for k in scene.moving_parts):
+            groups[part.first_triangle : part.first_triangle + part.triangle_count] = part.prim
+        points = wp.array(scene.points_at_rest, dtype=wp.vec3, device=scene.device)
+        of_triangle = wp.array(groups, dtype=wp.int32, device=scene.device)
+        self.mesh = wp.Mesh(points, indices, bvh_constructor="sah", groups=of_triangle)
+        self._fitted: wp.array | None = None
+
+    def to(self, points: wp.array | None) -> None:
+        """Fit it to the points of a scene, if it is not; None: whatever it is asked for next."""
+        if points is not None and self._fitted is not points:
+            wp.copy(self.mesh.points, points)
+            self.mesh.refit()
+        self._fitted = points
+
+
 class Tracer:
     """Owner of the triangle BVH of a scene, of one of its parts alone, or of those triangles that a mirror may show.
 
@@ -489,7 +515,8 @@ class Tracer:
     def __init__(self, scene: Scene, part: int | None = None, seen: np.ndarray | None = None):
         # Not the scene itself, which owns this: the pair would wait for the garbage collector, a scene a frame.
         self._device, self._view, self.origin = scene.device, scene.view, scene.origin
-        self._mesh = None
+        self._mesh: wp.Mesh | None = None
+        self._fit: Fit | None = None
         triangles = scene.host_triangles
         if part is not None:
             own = scene.parts[part]
@@ -500,16 +527,32 @@ class Tracer:
         if len(triangles):
             # The traversal wants flat indices. Copied: the structure's memory must not move.
             indices = wp.array(triangles.reshape(-1), dtype=wp.int32, device=scene.device)
-            constructor = "lbvh" if scene.device.is_cuda else "sah"
-            self._mesh = wp.Mesh(scene.view.points, indices, bvh_constructor=constructor)
+            if part is None and scene.moving_parts and not scene.device.is_cuda:
+                self._fit = Fit(scene, indices)
+                self._mesh = self._fit.mesh
+            else:
+                constructor = "lbvh" if scene.device.is_cuda else "sah"
+                self._mesh = wp.Mesh(scene.view.points, indices, bvh_constructor=constructor)
 
     @property
     def id(self) -> int:
+        if self._fit is not None:
+            self._fit.to(self._view.points)
         return self._mesh.id if self._mesh is not None else 0
+
+    def at(self, scene: Scene) -> Tracer | None:
+        """The same structure over the same stage's scene at another time, in which nothing but places differs; None: anew."""
+        if self._fit is None:
+            return None
+        other = copy.copy(self)
+        other._view, other.origin = scene.view, scene.origin
+        return other
 
     def refit(self) -> None:
         """Fit the structure to points that were moved in place."""
-        if self._mesh is not None:
+        if self._fit is not None:
+            self._fit.to(None)
+        elif self._mesh is not None:
             self._mesh.refit()
 
     def trace(

@@ -430,7 +430,7 @@ class Scene:
         for part in (self.parts[k] for k in self.moving_parts):
             first = ranges[part.prim].start if part.prim in ranges else part.first_triangle
             ranges[part.prim] = slice(first, part.first_triangle + part.triangle_count)
-        return joined_neighbours(self._points_at_rest, self.host_triangles, list(ranges.values()))
+        return joined_neighbours(self.points_at_rest, self.host_triangles, list(ranges.values()))
 
     @cached_property
     def neighbours(self) -> wp.array:
@@ -443,7 +443,7 @@ class Scene:
         first, count = (
             np.array([getattr(p, name) for p in self.parts], int) for name in ("first_triangle", "triangle_count")
         )
-        is_closed = closed_ranges(self._points_at_rest, self.host_triangles, self.host_neighbours, first, count)
+        is_closed = closed_ranges(self.points_at_rest, self.host_triangles, self.host_neighbours, first, count)
         closed = np.zeros(max(len(self.patch_shapes), 1), np.int32)
         for k in np.flatnonzero(is_closed):
             part = self.parts[k]
@@ -452,7 +452,7 @@ class Scene:
         return wp.array(closed, dtype=int, device=self.device)
 
     @property
-    def _points_at_rest(self) -> np.ndarray:
+    def points_at_rest(self) -> np.ndarray:
         """`host_points`, those of what moves as the frame of its mesh has them, mirrored where it is: the same at every time."""
         if not self.moving_parts:
             return self.host_points
@@ -609,7 +609,10 @@ class Scene:
         mesh, scene_from_object = self.data.meshes[instance.mesh], self.scene_from_object(instance)
         if not is_similarity(scene_from_object):
             return None
-        key = instance.mesh, part - next(k for k, each in enumerate(self.parts) if each.prim == prim)
+        first = part
+        while first and self.parts[first - 1].prim == prim:
+            first -= 1
+        key = instance.mesh, part - first
         if key not in self.bodies_in_place:
             own = (mesh.parts or [Part(0, len(mesh.triangles))])[key[1]]
             faces = mesh.triangles[own.first_triangle : own.first_triangle + own.triangle_count]

@@ -25,6 +25,7 @@ from warp_reflect.scene import (
 )
 
 # Of a scene, made at first use: what says nothing about where things are.
+TRACERS = ("tracer", "shadow_tracer")
 OF_SHAPE = ("host_neighbours", "neighbours", "closed_patches")
 PLACELESS = (*OF_SHAPE, "has_hole", "moving_parts", "still_tracer")
 
@@ -169,6 +170,10 @@ def _take_over(scene: Scene, earlier: Scene, moved: list[int], parts: list[int])
     scene.facts = {
         key: fact for key, fact in earlier.facts.items() if key[1] is not None and key[1] not in gone_triangles
     }
+    for name in TRACERS:
+        if name in known and not bent and (tracer := known[name].at(scene)) is not None:
+            # One object where it is one.
+            vars(scene)[name] = scene.tracer if known[name] is known.get("tracer") and name != "tracer" else tracer
     scene.part_tracers = {k: tracer for k, tracer in earlier.part_tracers.items() if k not in gone}
     ranges = [slice(p.first_triangle, p.first_triangle + p.triangle_count) for p in map(scene.parts.__getitem__, parts)]
     scene.mirror_tracers = {
