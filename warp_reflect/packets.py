@@ -32,49 +32,69 @@ TRAVERSAL = r"""
     };
     // One component of three, each lane its own.
     auto component = [&](I axis, F x, F y, F z) -> F { return pick(axis == 0, x, pick(axis == 1, y, z)); };
-    // Lanes `live` of rays from `o` along `d`, which meet what is nearer than `reach`. `nearest`: the first of it; otherwise
-    // a lane is done with the first thing found, and only whether there is one is told (`face`).
-    auto traverse = [&](auto nearest, I live, V o, V d, F reach) -> Met {
-        Met met{I(-1), reach, F(0.0f), F(0.0f)};
-        if (!bits(live)) return met;
-        const I zero_x = d.x == 0.0f, zero_y = d.y == 0.0f, zero_z = d.z == 0.0f;
-        const V inverse = V{1.0f / pick(zero_x, F(1.0e-20f), d.x), 1.0f / pick(zero_y, F(1.0e-20f), d.y),
-            1.0f / pick(zero_z, F(1.0e-20f), d.z)};
-        // intersect_ray_tri_woop's constants of a ray.
-        const F ax = __builtin_elementwise_abs(d.x), ay = __builtin_elementwise_abs(d.y), az = __builtin_elementwise_abs(d.z);
-        I kz = ipick(ay > ax, I(1), I(0));
-        kz = ipick(az > fmax(ax, ay), I(2), kz);
-        I kx = ipick(kz == 2, I(0), kz + 1), ky = ipick(kz == 0, I(2), ipick(kz == 1, I(0), I(1)));
-        const F dz = component(kz, d.x, d.y, d.z);
-        const I turned = dz < 0.0f;
-        const I kept = kx;
-        kx = ipick(turned, ky, kx);
-        ky = ipick(turned, kept, ky);
-        const F sx = component(kx, d.x, d.y, d.z) / dz, sy = component(ky, d.x, d.y, d.z) / dz, sz = 1.0f / dz;
-        const unsigned all = bits(live);
-        const int lead = __builtin_ctz(all);
-        const bool one_axis = !bits(live & ((kz != kz[lead]) | (kx != kx[lead])));
-        const int cx = kx[lead], cy = ky[lead], cz = kz[lead];
-        const F ox = component(kx, o.x, o.y, o.z), oy = component(ky, o.x, o.y, o.z), oz = component(kz, o.x, o.y, o.z);
-        const bool no_zeros = !bits(live & (zero_x | zero_y | zero_z));
-        auto alike = [&](F a) -> bool { const unsigned s = bits(live & (a < 0.0f)); return s == 0 || s == all; };
-        const bool one_way = no_zeros && alike(d.x) && alike(d.y) && alike(d.z);
+    // GROUPS vectors of rays from `o` along `d`, lanes `live` of them, which meet what is nearer than `reach`. `nearest`: the
+    // first of it; otherwise a lane is done with the first thing found, and only whether there is one is told (`face`).
+    auto traverse = [&](auto nearest, auto groups, const I* live, const V* o, const V* d, const F* reach, Met* met) {
+        constexpr int GROUPS = decltype(groups)::value;
+#define EACH_GROUP _Pragma("clang loop unroll(full)") for (int g = 0; g < GROUPS; ++g)
+        struct Ray { V o, inverse; F sx, sy, sz, ox, oy, oz; I kx, ky, kz, zero_x, zero_y, zero_z; } ray[GROUPS];
+        I mask[GROUPS], open[GROUPS];
+        bool no_zeros = true, one_axis = true, one_way = true;
+        int cx = -1, cy = 0, cz = 0;
+        unsigned low_x = 0, low_y = 0, low_z = 0, high_x = 0, high_y = 0, high_z = 0;
+        EACH_GROUP {
+            Ray& r = ray[g];
+            mask[g] = open[g] = live[g];
+            met[g] = Met{I(-1), reach[g], F(0.0f), F(0.0f)};
+            r.o = o[g];
+            r.zero_x = d[g].x == 0.0f; r.zero_y = d[g].y == 0.0f; r.zero_z = d[g].z == 0.0f;
+            r.inverse = V{1.0f / pick(r.zero_x, F(1.0e-20f), d[g].x), 1.0f / pick(r.zero_y, F(1.0e-20f), d[g].y),
+                1.0f / pick(r.zero_z, F(1.0e-20f), d[g].z)};
+            // intersect_ray_tri_woop's constants of a ray.
+            const F ax = __builtin_elementwise_abs(d[g].x), ay = __builtin_elementwise_abs(d[g].y);
+            I kz = ipick(ay > ax, I(1), I(0));
+            kz = ipick(__builtin_elementwise_abs(d[g].z) > fmax(ax, ay), I(2), kz);
+            const I after = ipick(kz == 2, I(0), kz + 1), before = ipick(kz == 0, I(2), kz - 1);
+            const F dz = component(kz, d[g].x, d[g].y, d[g].z);
+            r.kx = ipick(dz < 0.0f, before, after);
+            r.ky = ipick(dz < 0.0f, after, before);
+            r.kz = kz;
+            r.sx = component(r.kx, d[g].x, d[g].y, d[g].z) / dz;
+            r.sy = component(r.ky, d[g].x, d[g].y, d[g].z) / dz;
+            r.sz = 1.0f / dz;
+            r.ox = component(r.kx, o[g].x, o[g].y, o[g].z);
+            r.oy = component(r.ky, o[g].x, o[g].y, o[g].z);
+            r.oz = component(r.kz, o[g].x, o[g].y, o[g].z);
+            const unsigned all = bits(live[g]);
+            if (!all) continue;
+            if (cx < 0) {
+                const int lead = __builtin_ctz(all);
+                cx = r.kx[lead]; cy = r.ky[lead]; cz = r.kz[lead];
+            }
+            one_axis &= !bits(live[g] & ((r.kz != cz) | (r.kx != cx)));
+            no_zeros &= !bits(live[g] & (r.zero_x | r.zero_y | r.zero_z));
+            low_x |= bits(live[g] & (d[g].x < 0.0f)); high_x |= bits(live[g] & (d[g].x > 0.0f));
+            low_y |= bits(live[g] & (d[g].y < 0.0f)); high_y |= bits(live[g] & (d[g].y > 0.0f));
+            low_z |= bits(live[g] & (d[g].z < 0.0f)); high_z |= bits(live[g] & (d[g].z > 0.0f));
+        }
+        if (cx < 0) return;
+        one_way = no_zeros && !(low_x && high_x) && !(low_y && high_y) && !(low_z && high_z);
         // Where rays enter and leave a box: its planes by the sign that they share.
-        const BVHPackedNodeHalf* in_x = d.x[lead] < 0.0f ? node_uppers : node_lowers;
-        const BVHPackedNodeHalf* in_y = d.y[lead] < 0.0f ? node_uppers : node_lowers;
-        const BVHPackedNodeHalf* in_z = d.z[lead] < 0.0f ? node_uppers : node_lowers;
-        const BVHPackedNodeHalf* out_x = d.x[lead] < 0.0f ? node_lowers : node_uppers;
-        const BVHPackedNodeHalf* out_y = d.y[lead] < 0.0f ? node_lowers : node_uppers;
-        const BVHPackedNodeHalf* out_z = d.z[lead] < 0.0f ? node_lowers : node_uppers;
-        auto box = [&](int node, F& enter) -> I {
+        const BVHPackedNodeHalf* in_x = low_x ? node_uppers : node_lowers;
+        const BVHPackedNodeHalf* in_y = low_y ? node_uppers : node_lowers;
+        const BVHPackedNodeHalf* in_z = low_z ? node_uppers : node_lowers;
+        const BVHPackedNodeHalf* out_x = low_x ? node_lowers : node_uppers;
+        const BVHPackedNodeHalf* out_y = low_y ? node_lowers : node_uppers;
+        const BVHPackedNodeHalf* out_z = low_z ? node_lowers : node_uppers;
+        auto box = [&](const Ray& r, F far, int node, F& enter) -> I {
             F leave;
             if (one_way) {
-                enter = (in_x[node].x - o.x) * inverse.x;
-                leave = (out_x[node].x - o.x) * inverse.x;
-                enter = fmax((in_y[node].y - o.y) * inverse.y, enter);
-                leave = fmin((out_y[node].y - o.y) * inverse.y, leave);
-                enter = fmax((in_z[node].z - o.z) * inverse.z, enter);
-                leave = fmin((out_z[node].z - o.z) * inverse.z, leave);
+                enter = (in_x[node].x - r.o.x) * r.inverse.x;
+                leave = (out_x[node].x - r.o.x) * r.inverse.x;
+                enter = fmax((in_y[node].y - r.o.y) * r.inverse.y, enter);
+                leave = fmin((out_y[node].y - r.o.y) * r.inverse.y, leave);
+                enter = fmax((in_z[node].z - r.o.z) * r.inverse.z, enter);
+                leave = fmin((out_z[node].z - r.o.z) * r.inverse.z, leave);
             } else {
                 const auto& low = node_lowers[node];
                 const auto& high = node_uppers[node];
@@ -91,42 +111,42 @@ TRAVERSAL = r"""
                     enter = fmax(first, enter);
                     leave = fmin(last, leave);
                 };
-                slab(low.x, high.x, o.x, inverse.x, zero_x);
-                slab(low.y, high.y, o.y, inverse.y, zero_y);
-                slab(low.z, high.z, o.z, inverse.z, zero_z);
+                slab(low.x, high.x, r.o.x, r.inverse.x, r.zero_x);
+                slab(low.y, high.y, r.o.y, r.inverse.y, r.zero_y);
+                slab(low.z, high.z, r.o.z, r.inverse.z, r.zero_z);
             }
-            return (leave >= 0.0f) & (leave >= enter) & (enter < met.t);
+            return (leave >= 0.0f) & (leave >= enter) & (enter < far);
         };
         // a * b - c * d, intersect.h's way.
         auto difference = [](F a, F b, F c, F e) -> F {
             const F ce = c * e;
             return __builtin_elementwise_fma(a, b, -ce) + __builtin_elementwise_fma(-c, e, ce);
         };
-        auto triangle = [&](int face, I mask) -> I {
+        auto triangle = [&](int face, const Ray& r, I asked, Met& best) -> I {
             const float* a = tree_points + 3 * tree_corners[3 * face];
             const float* b = tree_points + 3 * tree_corners[3 * face + 1];
             const float* c = tree_points + 3 * tree_corners[3 * face + 2];
             F a_x, a_y, a_z, b_x, b_y, b_z, c_x, c_y, c_z;
             if (one_axis) {
-                a_x = a[cx] - ox; a_y = a[cy] - oy; a_z = a[cz] - oz;
-                b_x = b[cx] - ox; b_y = b[cy] - oy; b_z = b[cz] - oz;
-                c_x = c[cx] - ox; c_y = c[cy] - oy; c_z = c[cz] - oz;
+                a_x = a[cx] - r.ox; a_y = a[cy] - r.oy; a_z = a[cz] - r.oz;
+                b_x = b[cx] - r.ox; b_y = b[cy] - r.oy; b_z = b[cz] - r.oz;
+                c_x = c[cx] - r.ox; c_y = c[cy] - r.oy; c_z = c[cz] - r.oz;
             } else {
-                auto turn = [&](const float* p, F& x, F& y, F& z) {
-                    const F px = p[0] - o.x, py = p[1] - o.y, pz = p[2] - o.z;
-                    x = component(kx, px, py, pz);
-                    y = component(ky, px, py, pz);
-                    z = component(kz, px, py, pz);
+                auto turn_axes = [&](const float* p, F& x, F& y, F& z) {
+                    const F px = p[0] - r.o.x, py = p[1] - r.o.y, pz = p[2] - r.o.z;
+                    x = component(r.kx, px, py, pz);
+                    y = component(r.ky, px, py, pz);
+                    z = component(r.kz, px, py, pz);
                 };
-                turn(a, a_x, a_y, a_z);
-                turn(b, b_x, b_y, b_z);
-                turn(c, c_x, c_y, c_z);
+                turn_axes(a, a_x, a_y, a_z);
+                turn_axes(b, b_x, b_y, b_z);
+                turn_axes(c, c_x, c_y, c_z);
             }
-            const F Ax = a_x - sx * a_z, Ay = a_y - sy * a_z;
-            const F Bx = b_x - sx * b_z, By = b_y - sy * b_z;
-            const F Cx = c_x - sx * c_z, Cy = c_y - sy * c_z;
+            const F Ax = a_x - r.sx * a_z, Ay = a_y - r.sy * a_z;
+            const F Bx = b_x - r.sx * b_z, By = b_y - r.sy * b_z;
+            const F Cx = c_x - r.sx * c_z, Cy = c_y - r.sy * c_z;
             F edge_u = difference(Cx, By, Cy, Bx), edge_v = difference(Ax, Cy, Ay, Cx), edge_w = difference(Bx, Ay, By, Ax);
-            const unsigned exact = bits(mask & ((edge_u == 0.0f) | (edge_v == 0.0f) | (edge_w == 0.0f)));
+            const unsigned exact = bits(asked & ((edge_u == 0.0f) | (edge_v == 0.0f) | (edge_w == 0.0f)));
             for (unsigned left = exact; left != 0; left &= left - 1) {
                 const int l = __builtin_ctz(left);
                 edge_u[l] = (float)((double)Cx[l] * (double)By[l] - (double)Cy[l] * (double)Bx[l]);
@@ -135,71 +155,117 @@ TRAVERSAL = r"""
             }
             const F low = fmin(fmin(edge_u, edge_v), edge_w), high = fmax(fmax(edge_u, edge_v), edge_w);
             const F det = edge_u + edge_v + edge_w;
-            I hit = mask & ~((low < 0.0f) & (high > 0.0f)) & (det != 0.0f);
+            I hit = asked & ~((low < 0.0f) & (high > 0.0f)) & (det != 0.0f);
             if (!bits(hit)) return hit;
-            const F along = edge_u * (sz * a_z) + edge_v * (sz * b_z) + edge_w * (sz * c_z);
+            const F along = edge_u * (r.sz * a_z) + edge_v * (r.sz * b_z) + edge_w * (r.sz * c_z);
             const F inverse_det = 1.0f / det;
             const F t = along * inverse_det;
-            hit &= (pick(det < 0.0f, -along, along) >= 0.0f) & (t < met.t) & (t >= 0.0f);
+            hit &= (pick(det < 0.0f, -along, along) >= 0.0f) & (t < best.t) & (t >= 0.0f);
             if constexpr (decltype(nearest)::value) {
-                met.t = pick(hit, t, met.t);
-                met.u = pick(hit, edge_u * inverse_det, met.u);
-                met.v = pick(hit, edge_v * inverse_det, met.v);
+                best.t = pick(hit, t, best.t);
+                best.u = pick(hit, edge_u * inverse_det, best.u);
+                best.v = pick(hit, edge_v * inverse_det, best.v);
             }
-            met.face = ipick(hit, I(face), met.face);
+            best.face = ipick(hit, I(face), best.face);
             return hit;
         };
         // No deeper than Warp's own stack: its builders end a branch there.
-        int waiting[BVH_QUERY_STACK_SIZE];
-        I waiting_mask[BVH_QUERY_STACK_SIZE];
-        F waiting_enter[BVH_QUERY_STACK_SIZE];
-        int size_ = 0;
+        struct Waiting { I mask[GROUPS]; F enter[GROUPS]; int node; } waiting[BVH_QUERY_STACK_SIZE];
+        int waiting_count = 0;
         int node = *tree_mesh.bvh.root;
-        I mask = live;
         while (true) {
             const int first = node_lowers[node].i, second = node_uppers[node].i;
             if (node_lowers[node].b) {
                 for (int k = first; k < second; ++k) {
-                    const I hit = triangle(tree_primitives[k], mask);
-                    if constexpr (!decltype(nearest)::value) {
-                        mask &= ~hit;
-                        live &= ~hit;
-                        if (!bits(mask)) break;
+                    const int face = tree_primitives[k];
+                    I rest = I(0);
+                    EACH_GROUP {
+                        const I hit = triangle(face, ray[g], mask[g], met[g]);
+                        if constexpr (!decltype(nearest)::value) {
+                            mask[g] &= ~hit;
+                            open[g] &= ~hit;
+                            rest |= mask[g];
+                        }
                     }
+                    if constexpr (!decltype(nearest)::value) if (!bits(rest)) break;
                 }
-                if constexpr (!decltype(nearest)::value) if (!bits(live)) return met;
+                if constexpr (!decltype(nearest)::value) {
+                    I rest = I(0);
+                    EACH_GROUP rest |= open[g];
+                    if (!bits(rest)) return;
+                }
             } else {
-                F enter_first, enter_second;
-                const I to_first = mask & box(first, enter_first), to_second = mask & box(second, enter_second);
-                const unsigned ask_first = bits(to_first), ask_second = bits(to_second);
+                F enter_first[GROUPS], enter_second[GROUPS];
+                I to_first[GROUPS], to_second[GROUPS], any_first = I(0), any_second = I(0);
+                EACH_GROUP {
+                    to_first[g] = mask[g] & box(ray[g], met[g].t, first, enter_first[g]);
+                    to_second[g] = mask[g] & box(ray[g], met[g].t, second, enter_second[g]);
+                    any_first |= to_first[g];
+                    any_second |= to_second[g];
+                }
+                const bool ask_first = bits(any_first) != 0, ask_second = bits(any_second) != 0;
                 if (ask_first && ask_second) {
-                    const unsigned both = ask_first & ask_second;
-                    const unsigned nearer = bits(enter_first < enter_second);
-                    const bool first_now = both ? 2 * __builtin_popcount(nearer & both) >= __builtin_popcount(both)
-                        : __builtin_popcount(ask_first) >= __builtin_popcount(ask_second);
-                    waiting[size_] = first_now ? second : first;
-                    waiting_mask[size_] = first_now ? to_second : to_first;
-                    waiting_enter[size_++] = first_now ? enter_second : enter_first;
+                    int balance = 0;
+                    EACH_GROUP {
+                        const I both = to_first[g] & to_second[g];
+                        balance += __builtin_popcount(bits(both & (enter_first[g] < enter_second[g])));
+                        balance -= __builtin_popcount(bits(both & (enter_first[g] >= enter_second[g])));
+                    }
+                    const bool first_now = balance > 0;
+                    Waiting& later = waiting[waiting_count++];
+                    later.node = first_now ? second : first;
                     node = first_now ? first : second;
-                    mask = first_now ? to_first : to_second;
+                    EACH_GROUP {
+                        const I now = I(first_now ? -1 : 0);
+                        later.mask[g] = ipick(now, to_second[g], to_first[g]);
+                        if constexpr (decltype(nearest)::value)
+                            later.enter[g] = pick(now, enter_second[g], enter_first[g]);
+                        mask[g] = ipick(now, to_first[g], to_second[g]);
+                    }
                     continue;
                 }
-                if (ask_first) { node = first; mask = to_first; continue; }
-                if (ask_second) { node = second; mask = to_second; continue; }
+                if (ask_first || ask_second) {
+                    node = ask_first ? first : second;
+                    EACH_GROUP mask[g] = ask_first ? to_first[g] : to_second[g];
+                    continue;
+                }
             }
+            I rest;
             do {
-                if (size_ == 0) return met;
-                --size_;
-                node = waiting[size_];
-                mask = waiting_mask[size_];
-                if constexpr (decltype(nearest)::value) mask &= waiting_enter[size_] < met.t;
-                else mask &= live;
-            } while (!bits(mask));
+                if (waiting_count == 0) return;
+                const Waiting& next = waiting[--waiting_count];
+                node = next.node;
+                rest = I(0);
+                EACH_GROUP {
+                    if constexpr (decltype(nearest)::value) mask[g] = next.mask[g] & (next.enter[g] < met[g].t);
+                    else mask[g] = next.mask[g] & open[g];
+                    rest |= mask[g];
+                }
+            } while (!bits(rest));
         }
     };
     struct Nearest { enum { value = 1 }; };
     struct Any { enum { value = 0 }; };
-    auto first_met = [&](I live, V o, V d, F reach) -> Met { return traverse(Nearest{}, live, o, d, reach); };
-    auto is_met = [&](I live, V o, V d, F reach) -> I { return traverse(Any{}, live, o, d, reach).face >= 0; };
-    (void)flushed; (void)first_met; (void)is_met;
+    struct One { enum { value = 1 }; };
+    struct Two { enum { value = 2 }; };
+    auto first_met = [&](I live, V o, V d, F reach) -> Met {
+        Met met;
+        traverse(Nearest{}, One{}, &live, &o, &d, &reach, &met);
+        return met;
+    };
+    auto is_met = [&](I live, V o, V d, F reach) -> I {
+        Met met;
+        traverse(Any{}, One{}, &live, &o, &d, &reach, &met);
+        return met.face >= 0;
+    };
+    auto first_met_by = [&](const I* live, const V* o, const V* d, const F* reach, Met* met) {
+        traverse(Nearest{}, Two{}, live, o, d, reach, met);
+    };
+    auto is_met_by = [&](const I* live, const V* o, const V* d, const F* reach, I* blocked) {
+        Met met[2];
+        traverse(Any{}, Two{}, live, o, d, reach, met);
+        for (int g = 0; g < 2; ++g) blocked[g] = met[g].face >= 0;
+    };
+    (void)first_met; (void)is_met; (void)first_met_by; (void)is_met_by;
+    (void)flushed;
 """

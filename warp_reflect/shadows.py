@@ -543,7 +543,6 @@ def shadowed_irradiance(
         inputs = [mesh, scene.view, lights, distant, areas, *at, cast.samples]
         cut_shadows.cut_irradiance(inputs, result, threads)
         return result
-    found = wp.zeros(count * len(areas) if any(cast.areas) else 0, dtype=wp.uint8, device=device)
     index = wp.zeros(0, dtype=int, device=device)
     if any(cast.areas) and len(points.pixel):
         index = wp.full(points.width * points.height, -1, dtype=int, device=device)
@@ -552,11 +551,11 @@ def shadowed_irradiance(
         from warp_reflect import shadows_vector  # which sends this module's rays
 
         starts = shadows_vector.starts_of([scene.view, lights, *at], count, len(areas), device, threads)
-        if any(cast.areas):
-            shadows_vector.send_first(mesh, lights, areas, starts, count, first_count(cast.samples), found, threads)
-        around = [points.pixel, points.width, found, index]
-        shadows_vector.send_all(mesh, lights, distant, areas, starts, count, cast.samples, around, result, threads)
+        samples = first_count(cast.samples), cast.samples
+        image = [points.pixel, points.width, index]
+        shadows_vector.irradiance(mesh, lights, [distant, areas], starts, count, samples, image, result, threads)
         return result
+    found = wp.zeros(count * len(areas) if any(cast.areas) else 0, dtype=wp.uint8, device=device)
     if any(cast.areas):
         inputs = [mesh, scene.view, lights, areas, *at, first_count(cast.samples), found]
         launch.launch(first_rays_kernel, count, inputs, device, threads, split_min=TRACE_SPLIT_MIN)
@@ -599,7 +598,7 @@ def sky_share(
         from warp_reflect import shadows_vector
 
         starts = shadows_vector.starts_of([scene.view, scene.lights.direct, *at], count, 0, device, threads)
-        shadows_vector.send_to_sky(mesh, starts, count, samples, result, threads)
+        shadows_vector.sky_share(mesh, starts, count, samples, result, threads)
         return result
     inputs = [mesh, scene.view, *at, samples, result]
     launch.launch(sky_share_kernel, count, inputs, device, threads, split_min=TRACE_SPLIT_MIN)

@@ -19,6 +19,9 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FINITE_FL
 
 ROWS = 11  # of `Starts.rows`: point, normal, facet's normal, shift of the samples
 BLOCK_SPLIT_MIN = 8  # blocks; what `bvh.TRACE_SPLIT_MIN` rays are
+# What `send_blocks_kernel` does.
+FIRST, ALL, SKY = 0, 1, 2
+CODES = [FIRST, SKY, SPHERE, CYLINDER, DARK, LIT, NEIGHBOURS]
 
 
 @wp.struct
@@ -66,15 +69,14 @@ def starts_kernel(
         out_start.unshadowed[k, i] = area_irradiance(lights.areas[k], start.at, start.n)
 
 
-_RAYS = (
-    TRAVERSAL
-    + r"""
+@wp.func_native(
+    vector.snippet(
+        TRAVERSAL
+        + r"""
     const int begin = block * BLOCK;
     const int end = begin + BLOCK < count ? begin + BLOCK : count;
     const float* rows = starts.rows.data;
     const int stride = starts.rows.shape[1];
-    auto row = [&](int r, int i) -> F { return load(rows + r * stride + i); };
-    auto vrow = [&](int r, int i) -> V { return V{row(r, i), row(r + 1, i), row(r + 2, i)}; };
     auto root = [](F a) -> F { return __builtin_elementwise_sqrt(a); };
     auto below = [](F a) -> F { return a - __builtin_elementwise_floor(a); };
     // shadows.sample_place
@@ -155,189 +157,141 @@ _RAYS = (
         const V to_centre = sub(spread(light.centre), p);
         return ~(root(dot(to_centre, to_centre)) <= light.radius);
     };
-    (void)row; (void)vrow; (void)place_x; (void)place_y; (void)area_ray; (void)outside;
-"""
-)
-
-
-@wp.func_native(
-    vector.snippet(
-        _RAYS
-        + r"""
-    const int area_count = lights.areas.shape[0];
-    for (int start = begin; start < end; start += LANES) {
-        const I seen = start + lanes() < end;
-        for (int k = 0; k < area_count; ++k) {
-            if (cast_areas.data[k] == 0) continue;
-            const I asked = seen & (load(starts.unshadowed.data + k * stride + start) > 0.0f);
-            if (!bits(asked)) continue;
-            const auto& light = lights.areas.data[k];
-            const V p = vrow(0, start), n = vrow(3, start);
-            const F shift_x = row(9, start), shift_y = row(10, start);
-            const I asking = asked & outside(light, p);
-            F brought = F(0.0f), arrived = F(0.0f);
-            for (int s = 0; s < samples; ++s) {
-                const Ray ray = area_ray(light, p, n, place_x(F((float)s), shift_x), place_y(F((float)s), shift_y));
-                const I sent = asking & (ray.weight > 0.0f);
-                const I free = sent & ~is_met(sent, p, flushed(ray.d), ray.reach);
-                brought += pick(sent, ray.weight, F(0.0f));
-                arrived += pick(free, ray.weight, F(0.0f));
-            }
-            const F share = pick(brought == 0.0f, F(1.0f), arrived / brought);
-            const I found = ipick(share == 1.0f, I(lit), ipick(share == 0.0f, I(dark), I(lit | dark)));
-            for (unsigned left = bits(asked); left != 0; left &= left - 1) {
-                const int l = __builtin_ctz(left);
-                out_found.data[(start + l) * area_count + k] = (unsigned char)found[l];
-            }
-        }
-    }
-"""
-    )
-)
-def first_rays_block(
-    block: int,
-    mesh_id: wp.uint64,
-    lights: DirectView,
-    cast_areas: wp.array(dtype=int),
-    starts: Starts,
-    count: int,
-    samples: int,
-    sphere: int,
-    cylinder: int,
-    dark: int,
-    lit: int,
-    out_found: wp.array(dtype=wp.uint8),
-): ...
-
-
-@wp.kernel
-def first_rays_blocks_kernel(
-    first: int,
-    mesh_id: wp.uint64,
-    lights: DirectView,
-    cast_areas: wp.array(dtype=int),
-    starts: Starts,
-    count: int,
-    samples: int,
-    sphere: int,
-    cylinder: int,
-    dark: int,
-    lit: int,
-    # Outputs:
-    out_found: wp.array(dtype=wp.uint8),
-):
-    """One thread per block of points."""
-    block = first + wp.tid()
-    first_rays_block(block, mesh_id, lights, cast_areas, starts, count, samples, sphere, cylinder, dark, lit, out_found)
-
-
-@wp.func_native(
-    vector.snippet(
-        _RAYS
-        + r"""
+    // A light: a distant one, else a shape, or the sky.
+    constexpr int SKY = -1;
     const int area_count = lights.areas.shape[0], distant_count = lights.distant.shape[0];
-    float sum_x[BLOCK], sum_y[BLOCK], sum_z[BLOCK];
-    for (int start = begin; start < end; start += LANES) {
-        const I seen = start + lanes() < end;
-        const V p = vrow(0, start), n = vrow(3, start);
-        V total = same(0.0f);
-        for (int k = 0; k < distant_count; ++k) {
-            const auto& light = lights.distant.data[k];
-            const V to_light = spread(light.to_light);
-            const F cosine = dot(n, to_light);
-            I arrives = seen & (cosine > 0.0f);
-            if (cast_distant.data[k] != 0 && bits(arrives)) {
-                arrives &= ~is_met(arrives, p, flushed(to_light), F(3.0e38f));
-            }
-            total = vpick(arrives, add(total, times(cosine, spread(light.irradiance))), total);
-        }
-        store(sum_x + start - begin, total.x);
-        store(sum_y + start - begin, total.y);
-        store(sum_z + start - begin, total.z);
-    }
+    const bool to_sky = mode == sky_mode, only_first = mode == first_mode;
+    float sum_x[BLOCK], sum_y[BLOCK], sum_z[BLOCK], share[BLOCK], brought[BLOCK], arrived[BLOCK], before[BLOCK];
+    int asking[BLOCK];
+    for (int j = 0; j < BLOCK; ++j) sum_x[j] = sum_y[j] = sum_z[j] = 0.0f;
     // shadows.around
     auto around = [&](int i, int k) -> int {
         const int number = pixel.shape[0] > 0 ? pixel.data[i] : i;
-        const int height = index.shape[0] > 0 ? index.shape[0] / width : found.shape[0] / (width * area_count);
-        const int row_ = number / width, column = number - row_ * width;
+        const int height = index.shape[0] > 0 ? index.shape[0] / width : out_found.shape[0] / (width * area_count);
+        const int row = number / width, column = number - row * width;
         int together = 0;
-        for (int y = row_ - neighbours; y <= row_ + neighbours; ++y) {
+        for (int y = row - neighbours; y <= row + neighbours; ++y) {
             if (y < 0 || y >= height) continue;
             for (int x = column - neighbours; x <= column + neighbours; ++x) {
                 if (x < 0 || x >= width) continue;
                 int at = y * width + x;
                 if (index.shape[0] > 0) at = index.data[at];
-                if (at >= 0) together |= found.data[at * area_count + k];
+                if (at >= 0) together |= out_found.data[at * area_count + k];
             }
         }
         return together;
     };
-    for (int k = 0; k < area_count; ++k) {
-        const auto& light = lights.areas.data[k];
-        const float* unshadowed = starts.unshadowed.data + k * stride + begin;
-        float share[BLOCK], brought[BLOCK], arrived[BLOCK];
-        int asking[BLOCK];
+    for (int light = to_sky ? SKY : only_first ? distant_count : 0; light < (to_sky ? 0 : distant_count + area_count); ++light) {
+        const bool distant = light >= 0 && light < distant_count;
+        const int k = light - distant_count;
+        const int ray_count = distant ? 1 : samples;
+        // What would arrive unshadowed, `before`, and which points have to ask.
         int asking_count = 0;
         for (int j = 0; j < end - begin; ++j) {
+            const float* from = rows + begin + j;
+            const float n_x = from[3 * stride], n_y = from[4 * stride], n_z = from[5 * stride];
             share[j] = 1.0f;
-            if (!(unshadowed[j] > 0.0f) || cast_areas.data[k] == 0) continue;
-            const int together = around(begin + j, k);
-            if (together == (lit | dark)) {
-                brought[j] = arrived[j] = 0.0f;
-                asking[asking_count++] = j;
-            } else if (together == dark) {
-                share[j] = 0.0f;
+            bool asks;
+            if (to_sky) {
+                asks = n_x != 0.0f || n_y != 0.0f || n_z != 0.0f;
+            } else if (distant) {
+                const auto& to_light = lights.distant.data[light].to_light;
+                before[j] = n_x * to_light[0] + n_y * to_light[1] + n_z * to_light[2];
+                asks = before[j] > 0.0f && cast_distant.data[light] != 0;
+            } else {
+                before[j] = starts.unshadowed.data[k * stride + begin + j];
+                asks = before[j] > 0.0f && cast_areas.data[k] != 0;
+                if (asks && !only_first) {
+                    const int together = around(begin + j, k);
+                    asks = together == (lit | dark);
+                    if (together == dark) share[j] = 0.0f;
+                }
             }
+            if (!asks) continue;
+            brought[j] = arrived[j] = 0.0f;
+            asking[asking_count++] = j;
         }
         // Rays of a point lie side by side: they start at the same place.
         int point = 0, sample = 0;
         while (point < asking_count) {
-            int of[LANES], which[LANES], used = 0;
-            for (; used < LANES && point < asking_count; ++used) {
+            int of[2 * LANES], which[2 * LANES], used = 0;
+            for (; used < 2 * LANES && point < asking_count; ++used) {
                 of[used] = asking[point];
                 which[used] = sample;
-                if (++sample == samples) { sample = 0; ++point; }
+                if (++sample == ray_count) { sample = 0; ++point; }
             }
-            const bool alone = of[0] == of[used - 1];
-            for (int l = used; l < LANES; ++l) { of[l] = of[0]; which[l] = which[0]; }
-            const I own = iload(of);
-            const F s = __builtin_convertvector(iload(which), F);
-            V p, n;
-            F shift_x, shift_y;
-            if (alone) {
-                const float* from = rows + begin + of[0];
-                p = V{F(from[0]), F(from[stride]), F(from[2 * stride])};
-                n = V{F(from[3 * stride]), F(from[4 * stride]), F(from[5 * stride])};
-                shift_x = F(from[9 * stride]);
-                shift_y = F(from[10 * stride]);
-            } else {
-                auto pull = [&](int r) -> F { return gather(rows + r * stride + begin, own); };
-                p = V{pull(0), pull(1), pull(2)};
-                n = V{pull(3), pull(4), pull(5)};
-                shift_x = pull(9);
-                shift_y = pull(10);
+            for (int l = used; l < 2 * LANES; ++l) { of[l] = of[used - 1]; which[l] = which[used - 1]; }
+            V p[2], d[2];
+            F weight[2], reach[2];
+            I sent[2], met[2];
+            for (int g = 0; g < 2; ++g) {
+                const I own = iload(of + g * LANES);
+                const F s = __builtin_convertvector(iload(which + g * LANES), F);
+                const bool alone = of[g * LANES] == of[(g + 1) * LANES - 1];
+                auto pull = [&](int r) -> F {
+                    const float* from = rows + r * stride + begin;
+                    return alone ? F(from[of[g * LANES]]) : gather(from, own);
+                };
+                p[g] = V{pull(0), pull(1), pull(2)};
+                sent[g] = g * LANES + lanes() < used;
+                if (distant) {
+                    d[g] = flushed(spread(lights.distant.data[light].to_light));
+                    reach[g] = F(3.0e38f);
+                    weight[g] = F(1.0f);
+                    continue;
+                }
+                const V n = V{pull(3), pull(4), pull(5)};
+                const F x = place_x(s, pull(9)), y = place_y(s, pull(10));
+                if (to_sky) {
+                    // shadows.sky_ray
+                    F cosine, sine;
+                    V t1, t2;
+                    basis(n, t1, t2);
+                    turn(y, cosine, sine);
+                    d[g] = add(times(root(x), add(times(cosine, t1), times(sine, t2))), times(root(fmax(1.0f - x, F(0.0f))), n));
+                    reach[g] = F(3.0e38f);
+                    weight[g] = F(1.0f);
+                    sent[g] &= dot(d[g], V{pull(6), pull(7), pull(8)}) > 0.0f;
+                    d[g] = flushed(d[g]);
+                    continue;
+                }
+                const auto& area = lights.areas.data[k];
+                const Ray ray = area_ray(area, p[g], n, x, y);
+                d[g] = flushed(ray.d);
+                reach[g] = ray.reach;
+                weight[g] = ray.weight;
+                sent[g] &= outside(area, p[g]) & (ray.weight > 0.0f);
             }
-            const Ray ray = area_ray(light, p, n, place_x(s, shift_x), place_y(s, shift_y));
-            const I sent = (lanes() < used) & outside(light, p) & (ray.weight > 0.0f);
-            const unsigned free = bits(sent & ~is_met(sent, p, flushed(ray.d), ray.reach));
-            for (unsigned left = bits(sent); left != 0; left &= left - 1) {
-                const int l = __builtin_ctz(left);
-                brought[of[l]] += ray.weight[l];
-                if (free >> l & 1) arrived[of[l]] += ray.weight[l];
+            is_met_by(sent, p, d, reach, met);
+            for (int g = 0; g < 2; ++g) {
+                const unsigned free = bits(sent[g] & ~met[g]);
+                for (unsigned left = bits(sent[g]); left != 0; left &= left - 1) {
+                    const int l = __builtin_ctz(left), j = of[g * LANES + l];
+                    brought[j] += weight[g][l];
+                    if (free >> l & 1) arrived[j] += weight[g][l];
+                }
             }
         }
         for (int a = 0; a < asking_count; ++a) {
             const int j = asking[a];
             if (brought[j] != 0.0f) share[j] = arrived[j] / brought[j];
+            if (to_sky && brought[j] != 0.0f) out_share.data[begin + j] = share[j];
+            if (only_first) {
+                const int found = share[j] == 1.0f ? lit : share[j] == 0.0f ? dark : lit | dark;
+                out_found.data[(begin + j) * area_count + k] = (unsigned char)found;
+            }
         }
+        if (to_sky || only_first) continue;
+        const auto& color = distant ? lights.distant.data[light].irradiance : lights.areas.data[k].radiance;
         for (int j = 0; j < end - begin; ++j) {
-            if (!(unshadowed[j] > 0.0f)) continue;
-            const float arrives = unshadowed[j] * share[j];
-            sum_x[j] += arrives * light.radiance[0];
-            sum_y[j] += arrives * light.radiance[1];
-            sum_z[j] += arrives * light.radiance[2];
+            if (!(before[j] > 0.0f)) continue;
+            const float arrives = before[j] * share[j];
+            sum_x[j] += arrives * color[0];
+            sum_y[j] += arrives * color[1];
+            sum_z[j] += arrives * color[2];
         }
     }
+    if (to_sky || only_first) return;
     for (int j = 0; j < end - begin; ++j) {
         float* to = (float*)(out_irradiance.data + begin + j);
         to[0] = sum_x[j]; to[1] = sum_y[j]; to[2] = sum_z[j];
@@ -345,7 +299,7 @@ def first_rays_blocks_kernel(
 """
     )
 )
-def shadowed_block(
+def send_block(
     block: int,
     mesh_id: wp.uint64,
     lights: DirectView,
@@ -354,21 +308,25 @@ def shadowed_block(
     starts: Starts,
     count: int,
     samples: int,
+    pixel: wp.array(dtype=int),
+    width: int,
+    index: wp.array(dtype=int),
+    mode: int,
+    first_mode: int,
+    sky_mode: int,
     sphere: int,
     cylinder: int,
     dark: int,
     lit: int,
     neighbours: int,
-    pixel: wp.array(dtype=int),
-    width: int,
-    found: wp.array(dtype=wp.uint8),
-    index: wp.array(dtype=int),
+    out_found: wp.array(dtype=wp.uint8),
     out_irradiance: wp.array(dtype=wp.vec3),
+    out_share: wp.array(dtype=float),
 ): ...
 
 
 @wp.kernel
-def shadowed_blocks_kernel(
+def send_blocks_kernel(
     first: int,
     mesh_id: wp.uint64,
     lights: DirectView,
@@ -377,20 +335,24 @@ def shadowed_blocks_kernel(
     starts: Starts,
     count: int,
     samples: int,
+    pixel: wp.array(dtype=int),
+    width: int,
+    index: wp.array(dtype=int),
+    mode: int,
+    first_mode: int,
+    sky_mode: int,
     sphere: int,
     cylinder: int,
     dark: int,
     lit: int,
     neighbours: int,
-    pixel: wp.array(dtype=int),
-    width: int,
-    found: wp.array(dtype=wp.uint8),
-    index: wp.array(dtype=int),
     # Outputs:
+    out_found: wp.array(dtype=wp.uint8),
     out_irradiance: wp.array(dtype=wp.vec3),
+    out_share: wp.array(dtype=float),
 ):
-    """One thread per block of points."""
-    shadowed_block(
+    """One thread per block of points. Mode: the first rays to each shape, all rays that are worth it, or the domes'."""
+    send_block(
         first + wp.tid(),
         mesh_id,
         lights,
@@ -399,74 +361,21 @@ def shadowed_blocks_kernel(
         starts,
         count,
         samples,
+        pixel,
+        width,
+        index,
+        mode,
+        first_mode,
+        sky_mode,
         sphere,
         cylinder,
         dark,
         lit,
         neighbours,
-        pixel,
-        width,
-        found,
-        index,
+        out_found,
         out_irradiance,
+        out_share,
     )
-
-
-@wp.func_native(
-    vector.snippet(
-        _RAYS
-        + r"""
-    for (int start = begin; start < end; start += LANES) {
-        const V p = vrow(0, start), n = vrow(3, start), side = vrow(6, start);
-        const F shift_x = row(9, start), shift_y = row(10, start);
-        const I seen = (start + lanes() < end) & (dot(n, n) > 0.0f);
-        V t1, t2;
-        basis(n, t1, t2);
-        F free = F(0.0f), asked = F(0.0f);
-        for (int s = 0; s < samples; ++s) {
-            const F x = place_x(F((float)s), shift_x), radius = root(x);
-            F cosine, sine;
-            turn(place_y(F((float)s), shift_y), cosine, sine);
-            const V d = add(times(radius, add(times(cosine, t1), times(sine, t2))), times(root(fmax(1.0f - x, F(0.0f))), n));
-            const I sent = seen & (dot(d, side) > 0.0f);
-            asked += pick(sent, F(1.0f), F(0.0f));
-            free += pick(sent & ~is_met(sent, p, flushed(d), F(3.0e38f)), F(1.0f), F(0.0f));
-        }
-        const F share = free / asked;
-        for (unsigned left = bits(asked > 0.0f); left != 0; left &= left - 1) {
-            const int l = __builtin_ctz(left);
-            out_share.data[start + l] = share[l];
-        }
-    }
-"""
-    )
-)
-def sky_block(
-    block: int,
-    mesh_id: wp.uint64,
-    starts: Starts,
-    count: int,
-    samples: int,
-    sphere: int,
-    cylinder: int,
-    out_share: wp.array(dtype=float),
-): ...
-
-
-@wp.kernel
-def sky_blocks_kernel(
-    first: int,
-    mesh_id: wp.uint64,
-    starts: Starts,
-    count: int,
-    samples: int,
-    sphere: int,
-    cylinder: int,
-    # Outputs:
-    out_share: wp.array(dtype=float),
-):
-    """One thread per block of points."""
-    sky_block(first + wp.tid(), mesh_id, starts, count, samples, sphere, cylinder, out_share)
 
 
 def starts_of(inputs: list, count: int, area_count: int, device, threads: int = 0) -> Starts:
@@ -475,55 +384,52 @@ def starts_of(inputs: list, count: int, area_count: int, device, threads: int = 
     padded = vector.BLOCK * vector.block_count(count)
     starts.rows = wp.empty((ROWS, padded), dtype=float, device=device)
     starts.unshadowed = wp.empty((area_count, padded), dtype=float, device=device)
-    # Read by the lanes that the last vector has left, which do nothing.
-    for rows in (starts.rows, starts.unshadowed):
-        if rows.shape[0] and count < padded:
-            rows[:, count:].zero_()
     launch(starts_kernel, count, [*inputs, starts], device, threads)
     return starts
 
 
-def send_first(
+def irradiance(
     mesh: wp.uint64,
     lights: DirectView,
-    cast_areas: wp.array,
+    cast: list[wp.array],
     starts: Starts,
     count: int,
-    samples: int,
-    out_found: wp.array,
-    threads: int = 0,
-) -> None:
-    """As `shadows.first_rays_kernel`."""
-    inputs = [mesh, lights, cast_areas, starts, count, samples, SPHERE, CYLINDER, DARK, LIT, out_found]
-    _launch(first_rays_blocks_kernel, count, inputs, out_found.device, threads)
-
-
-def send_all(
-    mesh: wp.uint64,
-    lights: DirectView,
-    cast_distant: wp.array,
-    cast_areas: wp.array,
-    starts: Starts,
-    count: int,
-    samples: int,
-    around: list,
+    samples: tuple[int, int],
+    image: list,
     out_irradiance: wp.array,
     threads: int = 0,
 ) -> None:
-    """As `shadows.shadowed_kernel`; `around`: pixels, width, what `send_first` found, and `shadows.image_index_kernel`'s."""
-    kinds = [SPHERE, CYLINDER, DARK, LIT, NEIGHBOURS]
-    inputs = [mesh, lights, cast_distant, cast_areas, starts, count, samples, *kinds, *around, out_irradiance]
-    _launch(shadowed_blocks_kernel, count, inputs, out_irradiance.device, threads)
+    """As `shadows.first_rays_kernel` and `shadows.shadowed_kernel`.
+
+    Args:
+        mesh: What casts shadows.
+        lights: Distant ones and shapes.
+        cast: Which of either cast shadows.
+        starts: From `starts_of`.
+        count: Points.
+        samples: Rays to a shape that are always sent, and all of them.
+        image: The points' pixels, the image's width, and from `shadows.image_index_kernel` where its pixels are.
+        out_irradiance: vec3 [count].
+        threads: CPU threads; 0: one per core.
+    """
+    device = out_irradiance.device
+    asked = len(cast[1]) if cast[1].numpy().any() else 0
+    found = wp.zeros(count * asked, dtype=wp.uint8, device=device)
+    none = wp.zeros(0, dtype=float, device=device)
+    for mode in (FIRST, ALL) if asked else (ALL,):
+        inputs = [mesh, lights, *cast, starts, count, samples[mode == ALL], *image, mode, *CODES]
+        _launch(count, [*inputs, found, out_irradiance, none], device, threads)
 
 
-def send_to_sky(
-    mesh: wp.uint64, starts: Starts, count: int, samples: int, out_share: wp.array, threads: int = 0
-) -> None:
+def sky_share(mesh: wp.uint64, starts: Starts, count: int, samples: int, out_share: wp.array, threads: int = 0) -> None:
     """As `shadows.sky_share_kernel`."""
-    inputs = [mesh, starts, count, samples, SPHERE, CYLINDER, out_share]
-    _launch(sky_blocks_kernel, count, inputs, out_share.device, threads)
+    device = out_share.device
+    none = wp.zeros(0, dtype=int, device=device)
+    outputs = [wp.zeros(0, dtype=kind, device=device) for kind in (wp.uint8, wp.vec3)]
+    inputs = [mesh, DirectView(), none, none, starts, count, samples, none, 0, none, SKY, *CODES]
+    _launch(count, [*inputs, *outputs, out_share], device, threads)
 
 
-def _launch(kernel, count: int, inputs: list, device, threads: int) -> None:
+def _launch(count: int, inputs: list, device, threads: int) -> None:
     # Blocks of rays are worth a second thread sooner than `vector.launch_blocks` thinks.
-    launch(kernel, vector.block_count(count), inputs, device, threads, split_min=BLOCK_SPLIT_MIN)
+    launch(send_blocks_kernel, vector.block_count(count), inputs, device, threads, split_min=BLOCK_SPLIT_MIN)
