@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import warp_reflect as wr
+from warp_reflect.stage.read import StageReader
 
 STAGE = """#usda 1.0
 (
@@ -17,7 +18,7 @@ def Xform "World"
     {
         float2 clippingRange = (0.1, 100)
         float focalLength = 24
-        double3 xformOp:translate = (0, 1.5, 8)
+        double3 xformOp:translate.timeSamples = { 1: (0, 1.5, 8), 9: (0.5, 1.5, 8) }
         uniform token[] xformOpOrder = ["xformOp:translate"]
     }
     def DistantLight "Sun"
@@ -69,14 +70,31 @@ def Xform "World"
         float3 xformOp:scale = (SCALE, 1, 1)
         uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:scale"]
     }
+    def Xform "Cart"
+    {
+        double3 xformOp:translate.timeSamples = { 1: (-3, 0, 2), 9: (3, 0, 2) }
+        uniform token[] xformOpOrder = ["xformOp:translate"]
+        def Scope "Load"
+        {
+            def Cube "Box"
+            {
+                double size = 0.4
+                double3 xformOp:translate = (0, 0.3, 0)
+                uniform token[] xformOpOrder = ["xformOp:translate"]
+            }
+            def Cube "Post"
+            {
+                double size = 0.2
+                double3 xformOp:translate = (-2, 1.4, 0)
+                uniform token[] xformOpOrder = ["!resetXformStack!", "xformOp:translate"]
+            }
+        }
+    }
     def Mesh "Flag"
     {
         int[] faceVertexCounts = [4]
         int[] faceVertexIndices = [0, 1, 2, 3]
-        point3f[] points.timeSamples = {
-            1: [(-4, 0, -3), (-3, 0, -3), (-3, 2, -3), (-4, 2, -3)],
-            9: [(-4, 0, -3), (-3, 0, -3), (-3, 2, -2), (-4, 2, -1)],
-        }
+        point3f[] points FLAG
     }
 }
 """
@@ -90,11 +108,24 @@ ARRAYS = (
 )
 
 
-@pytest.fixture(params=["1", "-2"])
+POINTS = "[(-4, 0, -3), (-3, 0, -3), (-3, 2, -3), (-4, 2, -3)]"
+BENT = "[(-4, 0, -3), (-3, 0, -3), (-3, 2, -2), (-4, 2, -1)]"
+
+
+def stage(folder, scale: str = "1", is_waving: bool = False, **changes: str) -> str:
+    flag = f".timeSamples = {{ 1: {POINTS}, 9: {BENT} }}" if is_waving else f"= {POINTS}"
+    text = STAGE.replace("SCALE", scale).replace("points FLAG", "points" + (flag if is_waving else f" {flag}"))
+    for old, new in changes.items():
+        assert old in text
+        text = text.replace(old, new)
+    path = folder / "moving.usda"
+    path.write_text(text)
+    return str(path)
+
+
+@pytest.fixture(params=[("1", False), ("-2", False), ("1", True)])
 def path(request, tmp_path):
-    stage = tmp_path / "moving.usda"
-    stage.write_text(STAGE.replace("SCALE", request.param))
-    return str(stage)
+    return stage(tmp_path, *request.param)
 
 
 def told(scene: wr.Scene) -> dict:
@@ -129,9 +160,66 @@ def test_what_stands_still_is_shared(path):
     assert second.host_triangles is first.host_triangles and second.view.triangles is first.view.triangles
     assert second.still_tracer is not second.tracer
     assert second.at(6.0).still_tracer is second.still_tracer
-    flag = next(k for k, part in enumerate(second.parts) if part.prim_path.endswith("Flag"))
-    still = next(k for k, part in enumerate(second.parts) if part.prim_path.endswith("Still"))
-    assert second.bodies[still] is first.bodies[still] and flag not in second.bodies
+    ball, still = (
+        next(k for k, part in enumerate(second.parts) if part.prim_path.endswith(name)) for name in ("Ball", "Still")
+    )
+    assert second.bodies[still] is first.bodies[still] and ball not in second.bodies
+
+
+def test_places_alone_are_read_where_nothing_else_changes(tmp_path, monkeypatch):
+    reader = StageReader(stage(tmp_path))
+    first = reader.read(1.0)
+    with monkeypatch.context() as patch:
+        patch.setattr(StageReader, "_read", None)
+        later = reader.read(6.0)
+    fresh = StageReader(reader.path).read(6.0)
+    assert len(later.instances) == len(fresh.instances) and later.meshes[0] is first.meshes[0]
+    for ours, theirs in zip(later.instances, fresh.instances, strict=True):
+        assert (ours.prim_path, ours.materials, ours.moves) == (theirs.prim_path, theirs.materials, theirs.moves)
+        np.testing.assert_array_equal(ours.world_from_object, theirs.world_from_object)
+    np.testing.assert_array_equal(later.cameras[0].world_from_camera, fresh.cameras[0].world_from_camera)
+    assert later.notes == fresh.notes and later.time == 6.0
+
+
+CHANGES = {
+    "a light": {"float inputs:intensity = 2": "float inputs:intensity.timeSamples = { 1: 2, 9: 5 }"},
+    "a material": {"float inputs:roughness = 0": "float inputs:roughness.timeSamples = { 1: 0, 9: 0.1 }"},
+    "what is seen": {
+        "double size = 1": 'double size = 1\n token visibility.timeSamples = { 1: "inherited", 9: "invisible" }'
+    },
+    "a place that cannot be": {"9: (2, 1, 1) }": "5: (nan, 1, 1), 9: (2, 1, 1) }"},
+    "no camera": {'def Camera "Camera"': 'def Xform "Camera"'},
+}
+
+
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
+def test_a_stage_that_changes_otherwise_is_read_whole(change, tmp_path):
+    reader = StageReader(stage(tmp_path, **change))
+    reader.read(1.0)
+    for time in (5.0, 9.0):
+        later, fresh = reader.read(time), StageReader(reader.path).read(time)
+        assert [each.prim_path for each in later.instances] == [each.prim_path for each in fresh.instances]
+        assert later.materials == fresh.materials and later.notes == fresh.notes
+        assert [each.color for each in later.lights] == [each.color for each in fresh.lights]
+        np.testing.assert_array_equal(later.cameras[0].world_from_camera, fresh.cameras[0].world_from_camera)
+
+
+def test_a_stage_in_which_all_moves_has_its_own_frame_at_every_time(tmp_path):
+    text = {
+        "point3f[] points = [(-6": "double xformOp:rotateY.timeSamples = { 1: 0, 9: 5 }\n"
+        '        uniform token[] xformOpOrder = ["xformOp:rotateY"]\n        point3f[] points = [(-6',
+        'def Cube "Still"': 'over "Still"',
+        'def Mesh "Flag"': 'over "Flag"',
+        'def Cube "Post"': 'over "Post"',
+    }
+    path = stage(tmp_path, **text)
+    scene = wr.load_stage(path, time=1.0)
+    assert all(each.moves for each in scene.data.instances)
+    told(scene)
+    scene = scene.at(7.0)
+    fresh = told(wr.load_stage(path, time=7.0))
+    for name, value in told(scene).items():
+        np.testing.assert_array_equal(value, fresh[name], err_msg=name)
 
 
 @pytest.mark.parametrize("settings", [{}, {"shadows": "off", "refine": "strict"}, {"environment_update": "frame"}])

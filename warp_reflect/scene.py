@@ -347,7 +347,6 @@ class Scene:
         self.pyramids: dict = {}
         self.material_notes: list[Note] = []  # of what was met when the materials were prepared
         self.known_textures: tuple | None = None  # (`textures`, `texture_notes`) of another time
-        self.origin = _scene_origin(data)
         if earlier is not None:
             from warp_reflect import scene_times
 
@@ -355,6 +354,7 @@ class Scene:
             if moved is not None:
                 scene_times.lay_out(self, earlier, moved)
                 return
+        self.origin = _scene_origin(data)
         if any(material.textures for material in data.materials):
             from warp_reflect import pictures
 

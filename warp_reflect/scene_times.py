@@ -68,7 +68,7 @@ def _same(a, b) -> bool:
 def moved_instances(earlier: SceneData, data: SceneData) -> list[int] | None:
     """Which instances stand elsewhere, or are bent, in a later reading of a stage; None where more than that differs.
 
-    Lights, cameras and notes are not looked at.
+    Lights, cameras and notes are not looked at. Where all may move, so may the frame of the scene: that differs.
     """
     alike = (
         len(earlier.meshes) == len(data.meshes)
@@ -80,15 +80,20 @@ def moved_instances(earlier: SceneData, data: SceneData) -> list[int] | None:
     )
     if not alike:
         return None
-    if not data.instances:
-        return []
+    if all(each.moves for each in data.instances):
+        return None if data.instances else []
     before, now = (np.stack([each.world_from_object for each in one.instances]) for one in (earlier, data))
-    bent = {k for k, mesh in enumerate(data.meshes) if mesh is not earlier.meshes[k]}
+    bent = bent_meshes(earlier, data)
     moved = np.flatnonzero((before != now).any(axis=(1, 2)) | [each.mesh in bent for each in data.instances])
     # Mirrored, its triangles would be wound the other way.
     turned = np.linalg.det(before[moved, :3, :3]) * np.linalg.det(now[moved, :3, :3]) <= 0.0
     still = any(not data.instances[k].moves for k in moved)
     return None if turned.any() or still else moved.tolist()
+
+
+def bent_meshes(earlier: SceneData, data: SceneData) -> set[int]:
+    """Indices of the meshes that are not what they were."""
+    return {k for k, mesh in enumerate(data.meshes) if not _same(mesh, earlier.meshes[k])}
 
 
 def _same_but_bent(a: MeshData, b: MeshData) -> bool:
@@ -107,12 +112,12 @@ def lay_out(scene: Scene, earlier: Scene, moved: list[int]) -> None:
     """Lay out a scene like an earlier one with some instances elsewhere, and give it what is known of the others.
 
     Args:
-        scene: Has its data and its origin, which is the earlier scene's.
+        scene: Has its data.
         earlier: Of the same stage.
         moved: Of `moved_instances`.
     """
     scene.data = replace(scene.data, materials=earlier.data.materials)
-    scene.material_notes = earlier.material_notes
+    scene.origin, scene.material_notes = earlier.origin, earlier.material_notes
     scene.notes += [note for note in earlier.material_notes if note not in scene.notes]
     for name in ("host_triangles", "host_triangle_patch", "host_normal_index", "patch_shapes"):
         setattr(scene, name, getattr(earlier, name))
@@ -157,7 +162,7 @@ def _take_over(scene: Scene, earlier: Scene, moved: list[int], parts: list[int])
     """Findings that hold on: of the whole layout, and of the parts that did not move."""
     known, gone = vars(earlier), set(parts)
     gone_triangles = {scene.parts[k].first_triangle for k in parts}
-    bent = {k for k, mesh in enumerate(scene.data.meshes) if mesh is not earlier.data.meshes[k]}
+    bent = bent_meshes(earlier.data, scene.data)
     for name in PLACELESS:
         if name in known and not (bent and name in OF_SHAPE):
             vars(scene)[name] = known[name]

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from pxr import Tf, UsdGeom, UsdLux
 
-from warp_reflect.scene import CameraData, InstanceData, MaterialData, MeshData, Note, SceneData
+from warp_reflect.scene import InstanceData, MaterialData, MeshData, Note, SceneData
 from warp_reflect.stage.cameras import default_camera
 from warp_reflect.stage.detail import pixels_across, subdivision_level
 from warp_reflect.stage.geometry import SMOOTH_SCHEMES, read_gprim, read_mesh, subdivision_scheme
@@ -31,6 +31,27 @@ class MeshEntry:
     notes: list[Note]
 
 
+@dataclass(frozen=True)
+class Smooth:
+    """A subdivided mesh and what its level was chosen by.
+
+    Attributes:
+        paths: Of the prims that show it.
+        count: Of its placements.
+        box: Of its cage, in the frame of the mesh.
+        faces: Of its cage.
+        mirror: Whether it is one.
+        level: That was chosen.
+    """
+
+    paths: frozenset[str]
+    count: int
+    box: Box
+    faces: int
+    mirror: bool
+    level: int
+
+
 @dataclass
 class Assembly:
     """One reading's meshes, materials and instances.
@@ -40,6 +61,7 @@ class Assembly:
         level: 0: every mesh gets the detail it needs; 1 to 3: all get this level.
         choices: What the user calls a mirror.
         static: Meshes of earlier readings, by what they depend on; filled here.
+        smooth: The subdivided meshes whose level was chosen.
     """
 
     intake: Intake
@@ -47,6 +69,7 @@ class Assembly:
     choices: Choices
     static: dict[tuple, MeshEntry]
     meshes: list[MeshData] = field(default_factory=list)
+    smooth: list[Smooth] = field(default_factory=list)
 
     def complete(self, data: SceneData, drawn: list, placed: list[InstanceData]) -> None:
         """Fill meshes, materials and instances of `data`, and its camera where it has none.
@@ -93,7 +116,10 @@ class Assembly:
             level = self.level
             if level == 0 and key in boxes:
                 mirror = any(self._is_mirror(drawn[i], surfaces[i]) for i in members[key])
-                level = self._level(prim, boxes[key], stacks[key], mirror, data.cameras[0])
+                faces = self._cage_faces(prim)
+                level = subdivision_level(faces, mirror, pixels_across(*boxes[key], stacks[key], data.cameras[0]))
+                paths = frozenset(str(drawn[i].GetPath()) for i in members[key])
+                self.smooth.append(Smooth(paths, len(stacks[key]), boxes[key], faces, mirror, level))
             entries[key] = self._entry(key, prim, found, level)
 
         parts: dict[int, tuple[int, tuple[int, ...]]] = {}
@@ -184,12 +210,12 @@ class Assembly:
             return None
         return points.min(axis=0), points.max(axis=0)
 
-    def _level(self, prim, box: Box, worlds: np.ndarray, mirror: bool, camera: CameraData) -> int:
+    def _cage_faces(self, prim) -> int:
         try:
             counts = integers(UsdGeom.Mesh(prim).GetFaceVertexCountsAttr(), self.intake.time)
         except BadPrim:
             return 0  # told when the mesh is read
-        return subdivision_level(0 if counts is None else len(counts), mirror, pixels_across(*box, worlds, camera))
+        return 0 if counts is None else len(counts)
 
     def _is_mirror(self, prim, surfaces: list[Surface | None]) -> bool:
         for target, surface in zip(targets(prim), surfaces, strict=True):
@@ -227,14 +253,8 @@ def usable(placed: list[InstanceData], intake: Intake) -> list[InstanceData]:
     """The instances whose transforms can be used; the others noted, one note a prim."""
     if not placed:
         return []
-    worlds = np.stack([instance.world_from_object for instance in placed])
-    suspect = ~np.isfinite(worlds).all(axis=(1, 2))
-    with np.errstate(all="ignore"):
-        scale = np.linalg.norm(worlds[:, :3, :3], axis=1)
-        volume = np.abs(np.linalg.det(np.where(suspect[:, None, None], np.eye(3), worlds[:, :3, :3])))
-        # A cheap bound that no good transform fails; what fails it is looked at one by one.
-        suspect |= ~(volume > 1.0e-9 * scale.prod(axis=1)) | (scale.min(axis=1) < 1.0e-9 * scale.max(axis=1))
-        suspect |= (np.abs(worlds).max(axis=(1, 2)) > 1.0e9) | (worlds[:, 3] != [0.0, 0.0, 0.0, 1.0]).any(axis=1)
+    # What fails is looked at one by one.
+    suspect = suspect_worlds(np.stack([instance.world_from_object for instance in placed]))
     kept, blamed = [], set()
     for instance, look in zip(placed, suspect, strict=True):
         fault = transform_fault(instance.world_from_object) if look else ""
@@ -245,6 +265,17 @@ def usable(placed: list[InstanceData], intake: Intake) -> list[InstanceData]:
             where = f" (instance {instance.instance})" if instance.instance else ""
             intake.bad(instance.prim_path, f"{fault}{where}; prim dropped")
     return kept
+
+
+def suspect_worlds(worlds: np.ndarray) -> np.ndarray:
+    """Which transforms, float64 [n, 4, 4], may be unusable, bool [n], by a cheap bound that no good one fails."""
+    suspect = ~np.isfinite(worlds).all(axis=(1, 2))
+    with np.errstate(all="ignore"):
+        scale = np.linalg.norm(worlds[:, :3, :3], axis=1)
+        volume = np.abs(np.linalg.det(np.where(suspect[:, None, None], np.eye(3), worlds[:, :3, :3])))
+        suspect |= ~(volume > 1.0e-9 * scale.prod(axis=1)) | (scale.min(axis=1) < 1.0e-9 * scale.max(axis=1))
+        suspect |= (np.abs(worlds).max(axis=(1, 2)) > 1.0e9) | (worlds[:, 3] != [0.0, 0.0, 0.0, 1.0]).any(axis=1)
+    return suspect
 
 
 def used_box(mesh: MeshData) -> Box:

@@ -24,6 +24,7 @@ from warp_reflect.stage.finish import give_finishes
 from warp_reflect.stage.lights import SHADED_KINDS, default_dome
 from warp_reflect.stage.materialx import is_materialx_error
 from warp_reflect.stage.opacity import drop_transparent
+from warp_reflect.stage.places import Places
 from warp_reflect.stage.reflectors import Choices, choose_reflectors, parse_patterns
 from warp_reflect.stage.schema import register
 from warp_reflect.stage.walk import State, Walk
@@ -96,6 +97,7 @@ class StageReader:
         self._static: dict[tuple, MeshEntry] = {}
         self._pictures: dict = {}
         self._first: SceneData | None = None
+        self._smooth: list = []  # of the first reading
 
     def read(self, time: float | None = None) -> SceneData:
         """The stage at one time; see `read_stage`."""
@@ -104,6 +106,11 @@ class StageReader:
         if self._first is not None and self._is_still:
             return replace(self._first, time=time, notes=list(self._first.notes))
         code = Usd.TimeCode.EarliestTime() if time is None else Usd.TimeCode(float(time))
+        if self._first is not None and self._places is not None:
+            with quiet():
+                data = self._places.at(time, Intake(code, self.strict, self.limits, cache=self._pictures))
+            if data is not None:
+                return data
         intake = Intake(code, self.strict, self.limits, cache=self._pictures)
         try:
             with quiet():
@@ -126,6 +133,12 @@ class StageReader:
                 for attribute in prim.GetAuthoredAttributes()
             )
 
+    @cached_property
+    def _places(self) -> Places | None:
+        """What has to be asked of the stage at another time, where that is little."""
+        with quiet():
+            return Places.of(self.stage, self._first, self._smooth)
+
     def _read(self, time: float | None, intake: Intake) -> SceneData:
         data = self._metadata(time, intake)
         for error in self.stage.GetCompositionErrors():
@@ -137,7 +150,10 @@ class StageReader:
         placed = walk.below(self.stage.GetPseudoRoot(), State(np.eye(4)), Usd.PrimDefaultPredicate)
         data.lights, data.cameras = walk.lights, self._primary_first(walk.cameras)
         data.environment_maps = walk.environment_maps
-        Assembly(intake, self.level, choices, self._static).complete(data, walk.drawn, placed)
+        assembly = Assembly(intake, self.level, choices, self._static)
+        assembly.complete(data, walk.drawn, placed)
+        if self._first is None:
+            self._smooth = assembly.smooth
         choose_reflectors(data, choices)
         give_finishes(data, walk.finishes)
         drop_transparent(data, intake)

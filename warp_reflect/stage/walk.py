@@ -25,6 +25,18 @@ def _varies(prim) -> bool:
     return any(attribute.ValueMightBeTimeVarying() for attribute in prim.GetAuthoredAttributes())
 
 
+def world_of(prim, world_from_parent: np.ndarray, transforms: UsdGeom.XformCache) -> tuple[np.ndarray, bool]:
+    """(world_from_object of a prim, float64 [4, 4]; whether it takes nothing from its parent)."""
+    if not prim.IsA(UsdGeom.Imageable):
+        return world_from_parent, False
+    local, resets = transforms.GetLocalTransformation(prim)
+    world = column_matrix(local)
+    if not resets:
+        with np.errstate(invalid="ignore", over="ignore"):  # told by `transform_fault` where something is drawn
+            world = world_from_parent @ world
+    return world, resets
+
+
 @dataclass(frozen=True)
 class State:
     """What a prim inherits from the prims above it."""
@@ -124,12 +136,8 @@ class Walk:
             purpose_attribute = imageable.GetPurposeAttr()
             authored = purpose_attribute.HasAuthoredValue()
             purpose = str(purpose_attribute.Get(time)) if authored else state.purpose
-            local, resets = self.transforms.GetLocalTransformation(prim)
-            world = column_matrix(local)
-            if not resets:
-                with np.errstate(invalid="ignore", over="ignore"):  # told by `transform_fault` where something is drawn
-                    world = state.world_from_parent @ world
-            elif state.inside_instancer:
+            world, resets = world_of(prim, state.world_from_parent, self.transforms)
+            if resets and state.inside_instancer:
                 self.intake.note(prim.GetPath(), "xformOpOrder: !resetXformStack! stops at the point instancer")
             moves = state.moves or imageable.GetVisibilityAttr().ValueMightBeTimeVarying()
             moves = moves or (prim.IsA(UsdGeom.Xformable) and UsdGeom.Xformable(prim).TransformMightBeTimeVarying())
