@@ -41,19 +41,22 @@ def test_traced_pixels_cost_their_rays_by_the_logarithm_of_the_triangles():
 
 
 def test_planar_mirror_costs_a_vertex_a_triangle_and_a_pixel():
-    # 200 vertices, 100 triangles, 1000 pixels refined of which 5 % are traced, 1 for the layer.
-    assert predict(WORK, "planar", Settings(), ONES)["ms"] == pytest.approx(1e-3 * (200 + 100 + 1050 + 1))
+    # 200 vertices, 100 triangles, 1000 pixels drawn into and refined, of which 5 % are traced, 1 for the layer.
+    assert predict(WORK, "planar", Settings(), ONES)["ms"] == pytest.approx(1e-3 * (200 + 100 + 1000 + 1050 + 1))
     off = predict(WORK, "planar", Settings(refine="off"), ONES)
-    assert off["ms"] == off["first_ms"] == pytest.approx(1e-3 * (200 + 100 + 1000 + 1))
+    assert off["ms"] == off["first_ms"] == pytest.approx(1e-3 * (200 + 100 + 1000 + 1000 + 1))
 
 
 def test_curved_mirror_adds_what_it_cuts_and_a_first_frame_cuts_it():
     costs = dataclasses.replace(ONES, quadric_cold=5.0)
-    got = predict(WORK, "quadric", Settings(), costs)
-    warm = 2 * 200 + 2 * 100 + 1050 + 1
-    cold = 5 * 200 + 2 * 100 + 1050 + 1 + 200 + 200  # looked at, and cut
-    assert got["first_ms"] == pytest.approx(1e-3 * cold)
-    assert got["ms"] == pytest.approx(1e-3 * (0.9 * warm + 0.1 * cold))
+    for size, edge, added in ((16.0, 0.25, 200.0 * 64.0**0.85), (1e4, 0.25, 20200.0), (16.0, 0.0, 0.0)):
+        got = predict(dataclasses.replace(WORK, size_px=size), "quadric", Settings(edge_px=edge), costs)
+        rays = 300 if edge == 0.0 else 50  # edges that are not cut leave more to trace
+        every = 100 + added + 1000 + 1000 + rays + 1
+        warm = every + 200 + added
+        cold = every + 5 * 200 + (200 + added if edge else 0.0)  # looked at, and cut
+        assert got["first_ms"] == pytest.approx(1e-3 * cold)
+        assert got["ms"] == pytest.approx(1e-3 * (0.9 * warm + 0.1 * cold))
 
 
 @pytest.mark.parametrize(

@@ -37,6 +37,7 @@ from warp_reflect.settings import Settings
 from warp_reflect.timing import counted_by
 
 SIZE = (480, 270)
+SMALL = (160, 90)  # the same with few pixels
 REPEATS = 3  # the middle one of three frames counts
 ROWS = 24  # of a ball's facets, from pole to pole
 WALL_CELLS = 48  # along a side of each of six walls
@@ -84,7 +85,8 @@ def _measure(device: str, repeats: int, told: Callable[[str], None]) -> Costs:
             fine = _timed(ball, technique, repeats, edge_px=BENT_PX)
             added = fine.us("reflect/tessellate") - cold.us("reflect/tessellate")
             found["cut"] = added / max(fine.vertices - fine.scene_vertices, 1)
-            found["draw"] = warm.us("reflect/virtual_raster") / warm.triangles
+            small = _timed(ball, technique, repeats, warm=True, size=SMALL)
+            found["draw"], found["covered"] = _drawn(small, warm)
             found["refined"] = warm.us("reflect/refine") / warm.pixels
     off = _timed(ball, "quadric", repeats, refine="off")
     found["candidate"] = off.us("reflect/candidates") / off.pixels
@@ -170,6 +172,15 @@ def _timed(scene: Scene, method: str, repeats: int, warm: bool = False, size=SIZ
         sum(len(mesh.host_triangles) for mesh in meshes),
         sum(int(row.effects["shadows"].numbers.get("rays", 0)) for row in plan.lights),
     )
+
+
+def _drawn(small: _Measured, large: _Measured) -> tuple[float, float]:
+    """What a virtual triangle and a mirror pixel cost to draw, from pictures of two sizes."""
+    counts = np.array([[each.triangles, each.pixels] for each in (small, large)], np.float64)
+    spent = np.array([each.us("reflect/virtual_raster") for each in (small, large)])
+    found = np.linalg.solve(counts, spent) if np.linalg.det(counts) > 0.0 else spent[1] / counts[1] / 2.0
+    # A disturbed difference leaves each at least a part of the whole.
+    return tuple(float(max(value, 0.1 * spent[1] / count)) for value, count in zip(found, counts[1], strict=True))
 
 
 def _moved(plan: Plan, k: int):
