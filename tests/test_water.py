@@ -13,9 +13,11 @@ from panes import HALF, SIZE, WATER, balls, eye_rays, floor_error_px, frame, sho
 from rooms import CHROME, placed, sphere, square
 
 import warp_reflect as wr
+from warp_reflect import frame as frame_module
 from warp_reflect import raster, surface, waves
 from warp_reflect.images import write_exr
 from warp_reflect.scene import MaterialData, Scene, TextureRef
+from warp_reflect.timing import StageTimer
 
 WAVY = with_finish(WATER, wave_slope=0.05, wave_length=1.0, wave_speed=1.0)
 POOL = square(1, 20.0), placed(0, 0, -3)
@@ -193,6 +195,85 @@ def test_white_furnace_stays_white_on_waves(waves, transmission):
     rgb = frame(stage((*POOL, water), floor=False), waves=waves)["RGBA"][..., :3]
     assert rgb.max() <= 1.0 + 1e-3
     np.testing.assert_allclose(rgb, 1.0, atol=2e-3)
+
+
+def tilted_map(tmp_path, tilt):
+    """A mirror of 40 x 40 whose normal map is tilted the same way everywhere; slopes along x and -z."""
+    normal = np.array([-tilt[0], -tilt[1], 1.0])  # along u, v and the surface's normal
+    normal /= np.linalg.norm(normal)
+    write_exr(tmp_path / "n.exr", {"RGB": np.tile(np.float32(0.5 * normal + 0.5), (4, 4, 1))}, half=())
+    signed = {"color_space": "signed", "scale": (2.0, 2.0, 2.0, 1.0), "bias": (-1.0, -1.0, -1.0, 0.0)}
+    pool = square(1, 20.0)
+    pool.uvs, pool.uv_index = np.float32(pool.points[:, [0, 2]] * [1.0, -1.0]), pool.triangles
+    texture = TextureRef(str(tmp_path / "n.exr"), **signed)
+    mirror = MaterialData(metallic=1.0, roughness=0.0, base_color=(1.0,) * 3, textures={"normal": texture})
+    return pool, placed(0, 0, -3), mirror
+
+
+def test_the_slopes_of_waves_and_of_a_normal_map_are_added(tmp_path):
+    """Pixel by pixel, in float64: each alone, and both."""
+    pool, world, mirror = tilted_map(tmp_path, (0.08, -0.05))
+    wavy = with_finish(mirror, wave_slope=0.05, wave_length=1.0)
+    normals = {}
+    for name, material, settings in (
+        ("waves", wavy, {"bumps": "off"}),
+        ("map", wavy, {"waves": "off"}),
+        ("both", wavy, {}),
+    ):
+        scene = stage((pool, world, material))
+        plan = wr.make_plan(scene, size=SIZE, settings=wr.Settings(**settings))
+        gbuffer, layers = frame_module.reflect_scene(scene, plan, plan.camera, StageTimer(scene.device))
+        surfaces = frame_module._surfaces(scene, plan, gbuffer, layers)
+        shown, _ = frame_module._shown(scene, plan, gbuffer, None, layers, surfaces)
+        n = shown.normals.numpy().astype(float)[layers[1].pixels.pixel.numpy()]
+        normals[name] = -n[:, [0, 2]] / n[:, 1:2]
+    # Where no normal was turned towards the eye.
+    row = layers[1].pixels.pixel.numpy() // SIZE[0]
+    near = row > 66
+    assert near.sum() > 2000
+    np.testing.assert_allclose(normals["map"][near], np.tile((0.08, 0.05), (near.sum(), 1)), atol=1e-4)
+    np.testing.assert_allclose(normals["both"][near], normals["map"][near] + normals["waves"][near], atol=2e-5)
+
+
+def test_a_mirror_with_waves_and_a_normal_map_is_turned_once(tmp_path):
+    """By waves too low to see it shows what its map alone makes of it; by both, what rays say."""
+    pool, world, mirror = tilted_map(tmp_path, (0.04, -0.03))
+    alone = frame(stage((pool, world, mirror), *balls()), bumps="traced")
+    rows = {}
+    for slope in (1e-7, 0.03):
+        scene = stage((pool, world, with_finish(mirror, wave_slope=slope, wave_length=1.0)), *balls())
+        rows[slope] = [
+            frame(scene, waves=waves, bumps=bumps)
+            for waves, bumps in (("lookup", "lookup"), ("traced", "lookup"), ("lookup", "traced"))
+        ]
+        effects = rows[slope][0].plan.rows[0].effects
+        assert (
+            effects["waves"].on and effects["normal_map"].on and "added to the waves'" in effects["normal_map"].reason
+        )
+        np.testing.assert_array_equal(rows[slope][1]["RGBA"], rows[slope][2]["RGBA"])
+    seen = alone["reflectorId"] > 0
+    low, high = (
+        [np.abs(each[k]["reflection"] - each[1]["reflection"])[seen] for k in (0, 1)] for each in rows.values()
+    )
+    assert np.abs(rows[1e-7][1]["reflection"] - alone["reflection"])[seen].max() < 1e-3
+    # What one turn more would change.
+    still = frame(stage((pool, world, mirror), *balls()), bumps="off")
+    moved = np.abs(still["reflection"] - alone["reflection"])[seen].mean()
+    assert moved > 0.04
+    # Look-ups do not have what the still mirror does not show.
+    assert low[0].mean() < 0.4 * moved and high[0].mean() < 0.4 * moved
+
+
+@pytest.mark.parametrize("wave_slope", [0.0, 0.2])
+@pytest.mark.parametrize("how", ["lookup", "traced"])
+@pytest.mark.parametrize("values", [{}, {"clearcoat": 0.8}, {"roughness": 0.2, "clearcoat": 0.5}])
+def test_white_furnace_stays_white_on_normal_maps_and_waves(values, how, wave_slope, tmp_path):
+    pool, world, mirror = tilted_map(tmp_path, (0.3, -0.2))
+    material = with_finish(dataclasses.replace(mirror, **values), wave_slope=wave_slope, wave_length=0.5)
+    rgb = frame(stage((pool, world, material), floor=False), waves=how, bumps=how)["RGBA"][..., :3]
+    assert rgb.max() <= 1.0 + 1e-3
+    # A rough lobe loses what its facets shadow and mask.
+    np.testing.assert_allclose(rgb, 1.0, atol=0.2 if values.get("roughness") else 2e-3)
 
 
 def test_waves_are_finite_whatever_the_eye():

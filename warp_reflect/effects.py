@@ -73,9 +73,12 @@ def finish_effects(
         return {name: Effect(False, "not seen from the camera") for name in FINISHES}
     material = scene.data.materials[part.material]
     finish = finish_of(material, settings)
+    waves, normal_map = _waves(scene, part, finish, settings), _normal_map(material, settings, technique)
+    if waves.on and normal_map.on:
+        normal_map = Effect(True, f"{normal_map.reason}: its slopes are added to the waves'", normal_map.numbers)
     return {
-        "waves": _waves(scene, part, finish, settings),
-        "normal_map": _normal_map(material, settings, technique),
+        "waves": waves,
+        "normal_map": normal_map,
         "roughness": _roughness(material, settings),
         "clearcoat": _clearcoat(material, settings),
         "fade": _fade(finish, technique),

@@ -103,8 +103,11 @@ def put_kernel(
 def apply(
     scene: Scene, shown: shade.Shown, layer: ReflectionLayer, sharp: wp.array, radiance: wp.array, row
 ) -> wp.array:
-    """What a normal-mapped mirror shows, see `finishes`; a rough one's lobe is turned by the map itself (`glossy.py`)."""
-    if row.effects["roughness"].on:
+    """What a normal-mapped mirror shows, see `finishes`.
+
+    A rough one's lobe is turned by the map itself (`glossy.py`), and waves have the map's slopes added to theirs (`water.py`).
+    """
+    if row.effects["roughness"].on or row.effects["waves"].on:
         return radiance
     return turned_radiance(scene, shown, layer, radiance, row)
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import warp as wp
 
 from warp_reflect import launch, shade
-from warp_reflect.finishes import bumps, glossy
+from warp_reflect.finishes import bumps, glossy, water
 from warp_reflect.layers import ReflectionLayer
 from warp_reflect.scene import Scene, SceneView
 from warp_reflect.shade import schlick
@@ -65,6 +65,8 @@ def apply(
     pixels, settings, device = layer.pixels, row.settings, scene.device
     if row.effects["clearcoat"].numbers["roughness"] > settings.glossy_min_roughness:
         coat = glossy.lobe_radiance(scene, shown, layer, sharp, row, glossy.COAT)
+    elif row.effects["waves"].on:
+        coat = water.turned_radiance(scene, shown, layer, sharp, row)
     elif row.effects["normal_map"].on:
         coat = bumps.turned_radiance(scene, shown, layer, sharp, row)
     else:

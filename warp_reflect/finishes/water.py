@@ -190,9 +190,19 @@ def turn_kernel(
 def apply(
     scene: Scene, shown: shade.Shown, layer: ReflectionLayer, sharp: wp.array, radiance: wp.array, row
 ) -> wp.array:
-    """What a mirror with waves shows, see `finishes`. Maps are looked up either way: they show no place to trace to."""
+    """What a mirror with waves shows, see `finishes`; a rough one's lobe is turned by them itself (`glossy.py`)."""
+    if row.effects["roughness"].on:
+        return radiance
+    return turned_radiance(scene, shown, layer, radiance, row)
+
+
+def turned_radiance(scene: Scene, shown: shade.Shown, layer: ReflectionLayer, radiance: wp.array, row) -> wp.array:
+    """What a sharp mirror sees that waves turn, and its normal map where it has one, from what the still one does.
+
+    Maps are looked up however the rest is: they show no place to trace to.
+    """
     pixels, threads, device = layer.pixels, row.settings.threads, scene.device
-    if row.settings.waves == "traced" and layer.radiance is None:
+    if _is_traced(row) and layer.radiance is None:
         return traced(scene, shown, layer, row)
     width, hits = shown.gbuffer.camera.size[0], (layer.triangle, layer.distance)
     picture = make_picture(pixels, radiance, width, hits=hits, threads=threads, kernels=row.settings.kernels)
@@ -206,6 +216,11 @@ def apply(
     else:
         launch.launch(reflect_waves_kernel, pixels.count, inputs, device, threads)
     return wavy
+
+
+def _is_traced(row) -> bool:
+    """Whether rays are asked for of the waves, or of the normal map whose slopes are added to theirs."""
+    return row.settings.waves == "traced" or (row.effects["normal_map"].on and row.settings.bumps == "traced")
 
 
 def traced(scene: Scene, shown: shade.Shown, layer: ReflectionLayer, row) -> wp.array:
