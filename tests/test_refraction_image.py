@@ -4,13 +4,18 @@ import dataclasses
 
 import numpy as np
 import pytest
+import warp as wp
 from panes import GLASS, WATER, balls, stage, with_finish
 from rooms import placed, sphere, square
 
 import warp_reflect as wr
+from warp_reflect.launch import launch
+from warp_reflect.layers import CameraView
 from warp_reflect.scene import MaterialData
 from warp_reflect.settings import Status
 from warp_reflect.techniques import refraction_image
+from warp_reflect.techniques.refraction_vector import refract_blocks_kernel
+from warp_reflect.vector import launch_blocks
 
 SIZE = (213, 120)
 PAINT = MaterialData(base_color=(0.7, 0.3, 0.2), roughness=1.0)
@@ -105,6 +110,49 @@ def test_triangles_are_cut_where_they_cross_the_surface():
         share = (depth_of(weights @ corner) > 0.0).mean()
         full = np.linalg.norm(np.cross(corner[1] - corner[0], corner[2] - corner[0]))
         assert area[found.parents == parent].sum() == pytest.approx(share * full, abs=0.06 * full)
+
+
+@pytest.mark.parametrize("ior", [1.05, 1.333, 2.4])
+@pytest.mark.parametrize("height", [1e-3, 0.6, 50.0])
+def test_points_are_seen_by_the_law_of_refraction(ior, height):
+    """Both kernels against bisection in float64: deep, on the surface, under the eye, far away, behind the eye."""
+    rng = np.random.default_rng(5)
+    points = rng.normal(size=(333, 3)) * 10.0 ** rng.uniform(-2, 2, (333, 1))
+    points[:, 1] = -np.abs(points[:, 1])
+    points[:20, 1], points[20:40, [0, 2]], points[40] = 0.0, 0.0, 0.0
+    view = CameraView()
+    view.eye, view.forward, view.near, view.far = wp.vec3(0.0, height, 0.0), wp.vec3(0.0, 0.0, -1.0), 1e-4, 1e5
+    view.x_row, view.y_row = wp.vec4(300.0, 0.0, -160.0, 0.0), wp.vec4(0.0, -300.0, -90.0, 0.0)
+    given = wp.array(points.astype(np.float32), dtype=wp.vec3, device="cpu")
+    frame = [view, wp.vec3(0.0, 0.0, 0.0), wp.vec3(0.0, 1.0, 0.0), height, ior]
+    screens = [wp.zeros(333, dtype=wp.vec4, device="cpu") for _ in range(2)]
+    launch(refraction_image.refract_vertices_kernel, 333, [given, *frame, screens[0]], "cpu")
+    limits = [refraction_image.FOOT_STEPS, refraction_image.FOOT_DIGITS]
+    launch_blocks(refract_blocks_kernel, 333, [given, *frame, *limits, screens[1]], "cpu")
+    way, depth = np.hypot(points[:, 0], points[:, 2]), -points[:, 1]
+    low, high = np.zeros(333), way.copy()
+    for _ in range(80):
+        s = 0.5 * (low + high)
+        f = s / np.hypot(s, height) - ior * (way - s) / np.maximum(np.hypot(way - s, depth), 1e-300)
+        low, high = np.where(f < 0.0, s, low), np.where(f < 0.0, high, s)
+    s = 0.5 * (low + high)
+    crossing = np.stack([points[:, 0], 0.0 * s, points[:, 2]], 1) * (s / np.maximum(way, 1e-300))[:, None]
+    crossing[:, 1] = -height
+    length = np.linalg.norm(crossing, axis=1)
+    path = length + np.linalg.norm(points - [0.0, height, 0.0] - crossing, axis=1)
+    ray = crossing / length[:, None]
+    before = ray[:, 2] * path < -1e-3 * path  # well before the eye
+    ray[~before, 2] = -1.0
+    want = np.stack([160.0 + 300.0 * ray[:, 0] / -ray[:, 2], 90.0 - 300.0 * ray[:, 1] / -ray[:, 2]], 1)
+    assert before.sum() > 80
+    for screen in screens:
+        got = screen.numpy()
+        assert np.isfinite(got).all()
+        # A pixel is 1/300 radian: what float32 leaves of a depth far below a low eye.
+        off = np.abs(got[before, :2] - want[before]) / (1.0 + np.abs(want[before]))
+        assert np.quantile(off, 0.95) < 1e-3 and off.max() < 0.05
+        np.testing.assert_allclose(1.0 / got[before, 2], (-ray[:, 2] * path)[before], rtol=1e-3)
+    np.testing.assert_allclose(screens[1].numpy()[before], screens[0].numpy()[before], rtol=1e-3, atol=1e-3)
 
 
 def test_the_plan_says_how_and_why():

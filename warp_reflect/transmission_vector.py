@@ -38,6 +38,7 @@ BLOCK = wp.constant(vector.BLOCK)
         const I element = start + lanes();
         const I valid = element < end;
         const I own = ipick(valid, element, I(end - 1));
+        const bool full = start + LANES <= end;
         const I at = igather(pixel.data, own);
         const I tri = igather(triangle.data, at);
         const I patch = igather(scene.triangle_patch.data, tri);
@@ -55,8 +56,8 @@ BLOCK = wp.constant(vector.BLOCK)
         V p0, p1, p2;
         corners(records.data, tri, p0, p1, p2);
         V outward = facet_normal(p0, p1, p2);
-        V n = vgather((const float*)normal.data, own);
-        const V onward = vgather((const float*)direction.data, own);
+        V n = vrows((const float*)normal.data, start, full, own);
+        const V onward = vrows((const float*)direction.data, start, full, own);
         const V incident = unit(sub(onward, times(2.0f * dot(onward, n), n)));
         const I leaving = dot(outward, incident) > 0.0f;
         if (interface.kind == solid) {
@@ -123,6 +124,14 @@ BLOCK = wp.constant(vector.BLOCK)
         }
         outward = vpick(dot(outward, bent) < 0.0f, times(F(-1.0f), outward), outward);
         const unsigned char inside = interface.kind == solid ? 1 : 0;
+        if (full && !bits(~good)) {
+            istore(out_facet.data + start, tri);
+            for (int l = 0; l < LANES; ++l) out_inside.data[start + l] = inside;
+            vstore(normals_out, start, outward);
+            vstore(directions_out, start, bent);
+            vstore(weights_out, start, weight);
+            continue;
+        }
         for (unsigned left = bits(good); left != 0; left &= left - 1) {
             const int l = __builtin_ctz(left);
             const int i = start + l;

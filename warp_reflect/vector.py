@@ -154,6 +154,40 @@ _HEAD = r"""
         }
         return v;
     };
+    // Elements start .. start + LANES - 1 of an array of three floats each: rows are read and turned; and back.
+    auto vload = [vgather, lanes](const float* p, int start) -> V {
+#if defined(__AVX512F__)
+        return vgather(p, start + lanes());
+#else
+        F a, b, c;
+        __builtin_memcpy(&a, p + 3 * start, sizeof(a));
+        __builtin_memcpy(&b, p + 3 * start + 8, sizeof(b));
+        __builtin_memcpy(&c, p + 3 * start + 16, sizeof(c));
+        return V{
+            __builtin_shufflevector(__builtin_shufflevector(a, b, 0, 3, 6, 9, 12, 15, -1, -1), c, 0, 1, 2, 3, 4, 5, 10, 13),
+            __builtin_shufflevector(__builtin_shufflevector(a, b, 1, 4, 7, 10, 13, -1, -1, -1), c, 0, 1, 2, 3, 4, 8, 11, 14),
+            __builtin_shufflevector(__builtin_shufflevector(a, b, 2, 5, 8, 11, 14, -1, -1, -1), c, 0, 1, 2, 3, 4, 9, 12, 15)};
+#endif
+    };
+    auto vstore = [](float* p, int start, V v) {
+#if defined(__AVX512F__)
+        EACH_LANE { float* q = p + 3 * (start + l); q[0] = v.x[l]; q[1] = v.y[l]; q[2] = v.z[l]; }
+#else
+        const F a = __builtin_shufflevector(
+            __builtin_shufflevector(v.x, v.y, 0, 8, -1, 1, 9, -1, 2, 10), v.z, 0, 1, 8, 3, 4, 9, 6, 7);
+        const F b = __builtin_shufflevector(
+            __builtin_shufflevector(v.x, v.y, -1, 3, 11, -1, 4, 12, -1, 5), v.z, 10, 1, 2, 11, 4, 5, 12, 7);
+        const F c = __builtin_shufflevector(
+            __builtin_shufflevector(v.x, v.y, 13, -1, 6, 14, -1, 7, 15, -1), v.z, 0, 13, 2, 3, 14, 5, 6, 15);
+        __builtin_memcpy(p + 3 * start, &a, sizeof(a));
+        __builtin_memcpy(p + 3 * start + 8, &b, sizeof(b));
+        __builtin_memcpy(p + 3 * start + 16, &c, sizeof(c));
+#endif
+    };
+    // The same of what may end before: then the lanes' own numbers count.
+    auto vrows = [vload, vgather](const float* p, int start, bool full, I own) -> V {
+        return full ? vload(p, start) : vgather(p, own);
+    };
     // Corners of triangles, from `Scene.triangle_records`.
     auto corners = [gather8](const float* records, I triangle, V& p0, V& p1, V& p2) {
         F corner[8], corner_z;
@@ -167,6 +201,7 @@ _HEAD = r"""
     (void)bits; (void)lanes; (void)pick; (void)ipick; (void)fmin; (void)fmax; (void)sub; (void)add; (void)dot; (void)cross;
     (void)load; (void)iload; (void)store; (void)istore; (void)gather; (void)igather; (void)vgather; (void)halves; (void)gather8;
     (void)product; (void)vpick; (void)same; (void)grey; (void)spread; (void)clip; (void)unit; (void)corners; (void)facet_normal;
+    (void)vload; (void)vstore; (void)vrows;
 """
 
 

@@ -34,6 +34,7 @@ wp.set_module_options({"enable_backward": False})
         const I element = start + lanes();
         const I valid = element < end;
         const I own = ipick(valid, element, I(end - 1));
+        const bool full = start + LANES <= end;
         const I at = igather(pixel.data, own);
         const I tri = igather(triangle.data, at);
         V p0, p1, p2;
@@ -45,8 +46,8 @@ wp.set_module_options({"enable_backward": False})
         const V plane = add(add(spread(camera.ray_corner), times(x, spread(camera.ray_dx))), times(y, spread(camera.ray_dy)));
         const V d = parallel ? forward : plane;
         const F facing = dot(outward, d);
-        const V p = vgather((const float*)point.data, own);
-        const V n = vgather((const float*)normal.data, own);
+        const V p = vrows((const float*)point.data, start, full, own);
+        const V n = vrows((const float*)normal.data, start, full, own);
         const F depth = parallel ? F(1.0f) : dot(forward, sub(p, eye));
         V step_x = times(depth, spread(camera.ray_dx)), step_y = times(depth, spread(camera.ray_dy));
         step_x = sub(step_x, times(dot(outward, step_x) / facing, d));

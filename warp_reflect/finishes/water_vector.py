@@ -27,6 +27,10 @@ _PIXELS = r"""
     const int begin = block * BLOCK;
     const int end = begin + BLOCK < count ? begin + BLOCK : count;
     auto write = [&](float* to, int start, I mask, V v) {
+        if (!bits(~mask)) {
+            vstore(to, start, v);
+            return;
+        }
         for (unsigned left = bits(mask); left != 0; left &= left - 1) {
             const int l = __builtin_ctz(left);
             float* at = to + 3 * (start + l);
@@ -101,12 +105,13 @@ _LANES = r"""
         const I element = start + lanes();
         const I valid = element < end;
         const I own = ipick(valid, element, I(end - 1));
+        const bool full = start + LANES <= end;
         const I at = igather(pixel.data, own);
         const I row = at / camera.width;
         const F own_x = __builtin_convertvector(at - row * camera.width, F) + 0.5f;
         const F own_y = __builtin_convertvector(row, F) + 0.5f;
-        const V to_point = sub(vgather((const float*)point.data, own), eye);
-        const V kept = vgather((const float*)radiance.data, own);
+        const V to_point = sub(vrows((const float*)point.data, start, full, own), eye);
+        const V kept = vrows((const float*)radiance.data, start, full, own);
         const F distance = length(to_point);
         const F least = least_nearness / fmax(distance, F(least_depth));
         F x = own_x, y = own_y, near = nearness_at(own_x, own_y, F(0.0f));
@@ -122,6 +127,7 @@ _LANES = r"""
     for (int start = begin; start < end; start += LANES) {
         const I element = start + lanes();
         const I own = ipick(element < end, element, I(end - 1));
+        const bool full = start + LANES <= end;
         const I at = igather(pixel.data, own);
         F near;
         if (nearness.shape[0] > 0) {
@@ -130,7 +136,7 @@ _LANES = r"""
             const F way = gather(distance.data, own);
             near = pick((igather(triangle.data, own) >= 0) & (way > 0.0f), 1.0f / way, F(0.0f));
         }
-        const V d = vgather((const float*)direction.data, own), n = vgather((const float*)normal.data, own);
+        const V d = vrows((const float*)direction.data, start, full, own), n = vrows((const float*)normal.data, start, full, own);
         near = near / fmax(__builtin_elementwise_abs(dot(d, n)), F(least_cosine));
         const I row = at / image_width;
         const I texel = (row - out_picture.y0) * out_picture.width + at - row * image_width - out_picture.x0;
@@ -195,8 +201,8 @@ def fill_blocks_kernel(
     for (int start = begin; start < end; start += LANES) {"""
         + _LANES
         + r"""
-        const V n = vgather((const float*)normal.data, own);
-        const V direct = vgather((const float*)direction.data, own);
+        const V n = vrows((const float*)normal.data, start, full, own);
+        const V direct = vrows((const float*)direction.data, start, full, own);
         V shown = n;
         if (normals.shape[0] > 0) {
             const V mapped = vgather((const float*)normals.data, at);
@@ -296,7 +302,7 @@ def reflect_blocks_kernel(
     for (int start = begin; start < end; start += LANES) {"""
         + _LANES
         + r"""
-        const V n = times(F(-1.0f), vgather((const float*)normal.data, own));
+        const V n = times(F(-1.0f), vrows((const float*)normal.data, start, full, own));
         V shown = n;
         if (normals.shape[0] > 0) {
             const V mapped = vgather((const float*)normals.data, at);

@@ -18,12 +18,12 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from warp_reflect import bvh, raster
+from warp_reflect import bvh, raster, vector
 from warp_reflect.launch import launch
 from warp_reflect.layers import CameraView, GBuffer, ReflectionLayer, add_statistics, project
 from warp_reflect.scene import Scene
 from warp_reflect.settings import Settings
-from warp_reflect.techniques import planar, refine
+from warp_reflect.techniques import planar, refine, refraction_vector
 from warp_reflect.techniques.virtual_mesh import COARSE_MAX, CUT_MAX, STRADDLING_MAX, VirtualMesh, lattice_of
 
 wp.set_module_options({"enable_backward": False})
@@ -246,7 +246,11 @@ def follow(
 
     def seen_at(points: wp.array) -> wp.array:
         screen = wp.empty(len(points), dtype=wp.vec4, device=device)
-        launch(refract_vertices_kernel, len(points), [points, gbuffer.view, *frame, screen], device, threads)
+        if vector.chosen(settings.kernels, device):
+            inputs = [points, gbuffer.view, *frame, FOOT_STEPS, FOOT_DIGITS, screen]
+            vector.launch_blocks(refraction_vector.refract_blocks_kernel, len(points), inputs, device, threads)
+        else:
+            launch(refract_vertices_kernel, len(points), [points, gbuffer.view, *frame, screen], device, threads)
         return screen
 
     screen = seen_at(found.solved)
