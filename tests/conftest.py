@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 import warp as wp
 
 import warp_reflect
-from warp_reflect import launch
+from warp_reflect import kernels, launch, warmup
 
 # What `--warp-debug` runs where no files are named: tests that launch all kernels in seconds; file to names ("": all of it).
 BOUNDS = {
@@ -56,6 +57,8 @@ BOUNDS = {
     "test_viewer_session.py": ("test_search_path_descends_to_what_the_pixel_shows[newton",),
     "test_water.py": ("test_waves_are_finite", "test_the_mirrored_picture", "test_the_refracted_picture"),
 }
+ARCHITECTURES = (75, 80, 86, 89, 90, 100, 120)  # compute capabilities times ten: Turing to Blackwell
+MANY = 200  # tests, or a bounds-checked run: kernels are compiled ahead, on the core that most tests leave idle
 CHECKED_MIN = 0.9  # share of the package's kernels that a bounds-checked run launches, or it proves little
 LAUNCHED = pytest.StashKey[list]()
 CHECKED = pytest.StashKey[str]()
@@ -137,6 +140,42 @@ def device(request: pytest.FixtureRequest) -> str:
     if name not in known:
         pytest.exit(f"--device: got '{name}', this machine has {', '.join(known)}", returncode=2)
     return name
+
+
+@pytest.fixture(scope="session", autouse=True)
+def compiled_ahead(request: pytest.FixtureRequest) -> None:
+    """What tests will need is on its way to be compiled: for CUDA what they ask for, for the CPU all, where most are run."""
+    config = request.config
+    if any("compiled_for_cuda" in getattr(item, "fixturenames", ()) for item in request.session.items):
+        request.getfixturevalue("compiled_for_cuda")
+    if config.getoption("--device") == "cpu" and (len(request.session.items) > MANY or LAUNCHED in config.stash):
+        wp.init()
+        for name in warmup.kernel_modules():
+            launch.ready(kernels.modules_of(name), wp.get_device("cpu"))
+
+
+@pytest.fixture(scope="session")
+def compiled_for_cuda(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory):
+    """Gives the PTX of a kernel module, texts by architecture; what tests will ask for is compiled beside the others."""
+    every = request.config.getoption("--all-architectures")
+    architectures = ARCHITECTURES if every else (ARCHITECTURES[0], ARCHITECTURES[-1])
+
+    def compiled(name: str) -> dict[int, list[str]]:
+        texts: dict[int, list[str]] = {}
+        for module in kernels.modules_of(name):
+            for architecture in architectures:
+                folder = tmp_path_factory.mktemp("ptx")
+                made = wp.compile_aot_module(module, arch=[architecture], module_dir=folder, use_ptx=True)
+                found = [Path(path).read_text() for path in made if Path(path).suffix == ".ptx"]
+                texts.setdefault(architecture, []).extend(found)
+        return texts
+
+    asked = [item for item in request.session.items if "compiled_for_cuda" in getattr(item, "fixturenames", ())]
+    names = [item.callspec.params["module"] for item in asked]
+    with ThreadPoolExecutor(1) as pool:
+        begun = {name: pool.submit(compiled, name) for name in names}
+        yield lambda name: begun[name].result()
+        pool.shutdown(cancel_futures=True)
 
 
 @pytest.fixture

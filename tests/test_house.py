@@ -9,7 +9,6 @@ import sys
 from pathlib import Path
 
 import pytest
-import warp as wp
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "warp_reflect"
@@ -199,21 +198,12 @@ def test_kernels_are_launched_through_launch(module):
             assert ast.unparse(node.func) not in ("wp.launch", "wp.launch_tiled"), f"{module}, line {node.lineno}"
 
 
-ARCHITECTURES = (75, 80, 86, 89, 90, 100, 120)  # compute capabilities times ten: Turing to Blackwell
-
-
 @pytest.mark.parametrize("module", KERNEL_MODULES)
-def test_kernels_compile_for_cuda_without_a_gpu(module, tmp_path, request):
+def test_kernels_compile_for_cuda_without_a_gpu(module, compiled_for_cuda):
     """To PTX for the oldest and the newest architecture; with `--all-architectures` for those between as well."""
-    kernels = importlib.import_module(module)
-    every = request.config.getoption("--all-architectures")
-    architectures = ARCHITECTURES if every else (ARCHITECTURES[0], ARCHITECTURES[-1])
-    made = wp.compile_aot_module(kernels, arch=list(architectures), module_dir=tmp_path, use_ptx=True)
-    texts = [Path(path).read_text() for path in made if Path(path).suffix == ".ptx"]
-    targets = {
-        word.rstrip(",") for text in texts for line in text.splitlines() if ".target" in line for word in line.split()
-    }
-    assert {f"sm_{each}" for each in architectures} <= targets
-    for name in (node.name for node in ast.walk(ast.parse(FILES[module].read_text())) if is_kernel(node)):
-        for text in texts:
-            assert name in text
+    names = [node.name for node in ast.walk(ast.parse(FILES[module].read_text())) if is_kernel(node)]
+    for architecture, texts in compiled_for_cuda(module).items():
+        made = "".join(texts)
+        targets = {word.rstrip(",") for line in made.splitlines() if ".target" in line for word in line.split()}
+        assert f"sm_{architecture}" in targets
+        assert [name for name in names if name not in made] == []

@@ -20,6 +20,9 @@ from warp_reflect.settings import Status
 from warp_reflect.shapes import clamp_weights, facet_normal, intersect_triangle, max_abs
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FINITE_FLAGS})
+FREE, OWN, ONWARD, BOUNCED = (
+    launch.module_part(__name__, name, cpu_compiler_flags=FINITE_FLAGS) for name in ("free", "own", "onward", "bounced")
+)
 
 FLOAT_EPS = wp.constant(1.1920929e-7)  # one ulp of 1 in float32
 # A point made of barycentric weights is off its facet by at most about 4 roundings of its coordinates, the
@@ -228,7 +231,7 @@ def trace_ray(
     return result
 
 
-@wp.kernel
+@wp.kernel(module=FREE)
 def trace_kernel(
     first: int,
     mesh_id: wp.uint64,
@@ -335,7 +338,7 @@ def retry_pixels_kernel(
     out_status[i] = wp.uint8(hit.status)
 
 
-@wp.kernel
+@wp.kernel(module=OWN)
 def own_obstacles_kernel(
     first: int,
     mesh_id: wp.uint64,
@@ -420,7 +423,7 @@ def trace_onward(
     return result
 
 
-@wp.kernel
+@wp.kernel(module=ONWARD)
 def trace_onward_kernel(
     first: int,
     mesh_id: wp.uint64,
@@ -451,7 +454,7 @@ def trace_onward_kernel(
     out_status[i] = wp.uint8(hit.status)
 
 
-@wp.kernel
+@wp.kernel(module=BOUNCED)
 def trace_bounced_kernel(
     first: int,
     mesh_id: wp.uint64,

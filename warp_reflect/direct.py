@@ -19,6 +19,7 @@ from warp_reflect.shapes import clamp_weights, intersect_triangle, unit
 from warp_reflect.surface import hit_normal, shown_normal
 
 wp.set_module_options({"enable_backward": False})
+IRRADIANCE = launch.module_part(__name__, "irradiance")
 
 AREA_KINDS = ("sphere", "rect", "disk", "cylinder")
 POLYGON = wp.constant(0)
@@ -271,7 +272,7 @@ def eye_weights_kernel(
     out_v[i] = weights[1]
 
 
-@wp.kernel
+@wp.kernel(module=IRRADIANCE)
 def direct_kernel(
     first: int,
     scene: SceneView,

@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
 PACKAGE = __package__
 FORWARD = ("techniques.forward", "techniques.virtual_mesh")
-# Name of a technique, or of an effect that is on, to kernel modules; behind a bar those of vector kernels alone.
+# Name of a technique, or of an effect that is on, to kernel modules; a module's part stands after a slash, what is of vector
+# kernels alone after a bar, what is of plain ones after a minus.
 ROWS = {
     "planar": (*FORWARD, "techniques.planar"),
     "quadric": (*FORWARD, "techniques.quadric_patch", "|techniques.quadric_vector"),
@@ -29,8 +30,9 @@ ROWS = {
     "environment": ("environment_maps",),
     "layered_environment": ("environment_maps", "techniques.layered_environment", "techniques.local_map"),
     "raytraced": ("bvh",),
+    "refinement": ("|techniques.refine_vector", "-techniques.refine"),
     "grid": ("techniques.interpolation",),
-    "second_bounce": ("bounces",),
+    "second_bounce": ("bounces", "bvh/bounced"),
     "roughness": ("finishes.glossy", "finishes.layer_map"),
     "clearcoat": ("finishes.coat",),
     "fade": ("finishes.fade",),
@@ -39,8 +41,7 @@ ROWS = {
 
 def of_eye(settings: Settings, device: wp.DeviceLike) -> list[str]:
     """Those of every frame: known before its stage is read."""
-    shading = "shade_vector" if vectors(settings, device) else "shade"
-    return [*of_preview(settings, device), shading]
+    return [*of_preview(settings, device), *_of(["|shade_vector", "-shade/plain"], vectors(settings, device))]
 
 
 def of_preview(settings: Settings, device: wp.DeviceLike, casting: bool = False, mirrors: bool = False) -> list[str]:
@@ -51,11 +52,11 @@ def of_preview(settings: Settings, device: wp.DeviceLike, casting: bool = False,
         casting: Points are tried for what shadows do to them.
         mirrors: So they are in mirrors that are seen.
     """
-    asked = ["|vector", "raster", "|raster_vector"]
+    asked = ["|vector", "raster", "|raster_vector", "-raster/plain"]
     if casting:
-        asked += ["direct", "shadows"]
+        asked += ["direct", "shadows/tried"]
     if mirrors:
-        asked += ["surface", "|surface_vector", "bvh"]
+        asked += ["surface", "|surface_vector", "-surface/plain", "bvh"]
     return _of(asked, vectors(settings, device))
 
 
@@ -65,14 +66,13 @@ def of_plan(plan: Plan) -> list[str]:
     asked: list[str] = []
     seen = [row for row in plan.rows if row.pixels > 0]
     if plan.shadows is not None and plan.shadows.direct and plan.scene.triangle_count:
-        asked += ["direct", *(["cut_shadows"] if plan.scene.has_hole is not None else ["shadows", "|shadows_vector"])]
+        cut = plan.scene.has_hole is not None
+        asked += ["direct", *(["cut_shadows"] if cut else ["|shadows_vector", "-shadows/plain"])]
     if seen:
-        asked += ["surface", "|surface_vector", "shade"]
+        asked += ["surface", "|surface_vector", "-surface/plain", "shade"]
     for row in seen:
         on = [row.technique, *(name for name, effect in row.effects.items() if effect.on)]
         asked += [module for name in on for module in ROWS.get(name, ())]
-        if row.effects["refinement"].on:
-            asked += ["techniques.refine_vector" if vector else "techniques.refine"]
     if any(pane.pixels > 0 for pane in plan.panes):
         asked += ["transmission", "|transmission_vector"]
     return _of(asked, vector)
@@ -84,14 +84,21 @@ def vectors(settings: Settings, device: wp.DeviceLike) -> bool:
 
 
 def _of(asked: list[str], vector: bool) -> list[str]:
-    return list(dict.fromkeys(name.removeprefix("|") for name in asked if vector or not name.startswith("|")))
+    left = "-" if vector else "|"
+    return list(dict.fromkeys(name.lstrip("|-") for name in asked if not name.startswith(left)))
+
+
+def modules_of(name: str) -> list[wp.Module]:
+    """Warp's modules of a module of the package by its full name, which is imported: its own, and parts of it."""
+    found = vars(importlib.import_module(name)).values()
+    made = {each.module.name: each.module for each in found if isinstance(each, wp.Kernel)}
+    return [module for key, module in made.items() if key == name or key.startswith(f"{name}.")]
 
 
 def begin(names: Iterable[str], device: wp.DeviceLike) -> None:
     """Begin to compile and load modules of the package, without waiting: see `launch.ready`. On CUDA launches do."""
     if wp.get_device(device).is_cuda:
         return
-    full = [f"{PACKAGE}.{name}" for name in names]
-    for name in full:
-        importlib.import_module(name)
-    launch.ready([wp.get_module(name) for name in full], device)
+    for name in names:
+        importlib.import_module(f"{PACKAGE}.{name.partition('/')[0]}")
+        launch.ready([wp.get_module(f"{PACKAGE}.{name.replace('/', '.')}")], device)

@@ -130,6 +130,19 @@ def launch_bands(kernel, ranges: list[tuple[int, int]], bands: list[tuple[int, i
     run_parallel([partial(draw, band) for band in bands])
 
 
+def module_part(home: str, name: str, **options) -> wp.Module:
+    """A part of a kernel module, for `wp.kernel(module=...)`: compiled only where one of its own kernels is launched.
+
+    Args:
+        home: The Python module, `__name__`.
+        name: What the part is for.
+        options: Of Warp's module, beside the house's own.
+    """
+    made = wp.get_module(f"{home}.{name}")
+    made.options.update({"enable_backward": False, **options})
+    return made
+
+
 def ready(modules: Iterable[wp.Module], device) -> list[Future]:
     """Begin to compile and load kernel modules for a CPU, several at a time; a launch waits for its own."""
     return [_begun(module, wp.get_device(device)) for module in modules]

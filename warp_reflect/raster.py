@@ -19,12 +19,14 @@ import numpy as np
 import warp as wp
 
 from warp_reflect import vector
-from warp_reflect.launch import launch, launch_bands, slice_length
+from warp_reflect.launch import launch, launch_bands, module_part, slice_length
 from warp_reflect.layers import Camera, CameraView, GBuffer, MirrorPixels, project
 from warp_reflect.scene import Scene
 from warp_reflect.shapes import unit
 
 wp.set_module_options({"enable_backward": False})
+PLAIN = module_part(__name__, "plain")  # what vector kernels do elsewhere
+RAYS = module_part(__name__, "rays")
 
 SUBPIXEL = wp.constant(256)  # positions per pixel
 HALF_PIXEL = wp.constant(128)
@@ -379,7 +381,7 @@ def triangle_plane(points: wp.array(dtype=wp.vec3), corners: wp.vec3i) -> PlaneV
     return plane
 
 
-@wp.kernel
+@wp.kernel(module=PLAIN)
 def draw_kernel(
     first: int,
     target: TargetView,
@@ -440,7 +442,7 @@ def project_kernel(
     out_screen[i] = project(camera, points[i] - camera.eye)
 
 
-@wp.kernel
+@wp.kernel(module=RAYS)
 def ray_image_kernel(
     first: int,
     camera: CameraView,

@@ -37,6 +37,7 @@ from warp_reflect.surface import hit_normal, shown_normal
 from warp_reflect.textures import Look, plain_look, prepare_looks
 
 wp.set_module_options({"enable_backward": False})
+PLAIN = launch.module_part(__name__, "plain")  # what vector kernels do elsewhere
 
 # The grey dome of a stage without any light: radiance at the horizon, and what is added straight up and taken
 # straight down, so that shapes can be told.
@@ -395,7 +396,7 @@ def hit_radiance(
     return base
 
 
-@wp.kernel
+@wp.kernel(module=PLAIN)
 def shade_kernel(
     first: int,
     scene: SceneView,
@@ -448,7 +449,7 @@ def shade_kernel(
     out_picture[i] = wp.vec4(base[0], base[1], base[2], coverage)
 
 
-@wp.kernel
+@wp.kernel(module=PLAIN)
 def seen_radiance_kernel(
     first: int,
     scene: SceneView,

@@ -29,6 +29,8 @@ from warp_reflect.shapes import unit
 from warp_reflect.surface import hit_normal, shown_normal
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FINITE_FLAGS})
+# What vector kernels do elsewhere, and what tries lights for a plan.
+PLAIN, TRIED = (launch.module_part(__name__, name, cpu_compiler_flags=FINITE_FLAGS) for name in ("plain", "tried"))
 
 # Rays towards a shape end this share of the way before it, so that a lamp's own surface, drawn where the light is, does
 # not hide it from without.
@@ -299,7 +301,7 @@ def image_index_kernel(first: int, pixel: wp.array(dtype=int), out_index: wp.arr
     out_index[pixel[i]] = i
 
 
-@wp.kernel
+@wp.kernel(module=PLAIN)
 def first_rays_kernel(
     first: int,
     mesh_id: wp.uint64,
@@ -355,7 +357,7 @@ def around(
     return together
 
 
-@wp.kernel
+@wp.kernel(module=PLAIN)
 def shadowed_kernel(
     first: int,
     mesh_id: wp.uint64,
@@ -412,7 +414,7 @@ def shadowed_kernel(
     out_irradiance[i] = total
 
 
-@wp.kernel
+@wp.kernel(module=TRIED)
 def light_shares_kernel(
     first: int,
     mesh_id: wp.uint64,
@@ -465,7 +467,7 @@ def sky_ray(n: wp.vec3, place: wp.vec2) -> wp.vec3:
     return wp.sqrt(place[0]) * (angle[0] * t1 + angle[1] * t2) + wp.sqrt(wp.max(1.0 - place[0], 0.0)) * n
 
 
-@wp.kernel
+@wp.kernel(module=PLAIN)
 def sky_share_kernel(
     first: int,
     mesh_id: wp.uint64,

@@ -25,6 +25,8 @@ from warp_reflect.scene import SHAPE_PLANE, SHAPE_QUADRIC, Scene, SceneView
 from warp_reflect.shapes import clamp_weights, facet_normal, intersect_triangle, max_abs, unit
 
 wp.set_module_options({"enable_backward": False})
+PLAIN = launch.module_part(__name__, "plain")  # what vector kernels do elsewhere
+CHANNELS = launch.module_part(__name__, "channels")
 
 # An interpolated normal shorter than this has lost its direction (corners apart); the facet's is used.
 LEAST_NORMAL = wp.constant(0.1)
@@ -269,7 +271,7 @@ def mirror_pixel(
     out_direction[i] = (1.5 - 0.5 * wp.dot(d, d)) * d
 
 
-@wp.kernel
+@wp.kernel(module=PLAIN)
 def mirror_pixels_kernel(
     first: int,
     scene: SceneView,
@@ -406,7 +408,7 @@ def _pixels_by_reflector(reflector_id: np.ndarray, parts: Mapping[int, int]) -> 
     return {reflector: pixel[ids == reflector] for reflector in parts}
 
 
-@wp.kernel
+@wp.kernel(module=CHANNELS)
 def surface_channels_kernel(
     first: int,
     scene: SceneView,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import importlib
 from collections.abc import Iterator
 from pathlib import Path
 from time import perf_counter
@@ -12,6 +11,7 @@ import warp as wp
 
 from warp_reflect import launch, vector
 from warp_reflect.frame import render_frame
+from warp_reflect.kernels import modules_of
 from warp_reflect.planner import Plan
 from warp_reflect.scene import Scene
 
@@ -48,10 +48,7 @@ def warm_all(device: wp.DeviceLike, threads: int = 0) -> tuple[list[str], float]
     start = perf_counter()
     device = wp.get_device(device)
     names = [name for name in kernel_modules() if not name.endswith("_vector") or _runs_vectors(device)]
-    modules = []
-    for name in names:
-        importlib.import_module(name)
-        modules.append(wp.get_module(name))
+    modules = [module for name in names for module in modules_of(name)]
     if device.is_cpu:
         for loading in launch.ready(modules, device):
             loading.result()
