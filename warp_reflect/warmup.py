@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from time import perf_counter
 
@@ -18,21 +18,25 @@ from warp_reflect.scene import Scene
 PACKAGE = Path(__file__).parent
 
 
-def warm_plan(scene: Scene, plan: Plan) -> tuple[list[str], float]:
-    """Make a first frame, one that follows it, and all their channels.
+def warm_plan(scene: Scene, make_plan: Callable[[], Plan]) -> tuple[Plan, list[str], float]:
+    """Plan, make a first frame, one that follows it, and all their channels.
+
+    Args:
+        scene: The scene.
+        make_plan: Plans it; what the plan looks at is drawn for it, and not again for the frame.
 
     Returns:
-        (names of the kernel modules that they launch, seconds of loading and compiling).
+        (the plan, names of the kernel modules that all this launches, seconds of loading and compiling).
     """
     before = launch.loading_ms()
     with launch.recorded() as launches:
-        frame = None
+        plan, frame = make_plan(), None
         for _ in range(2):
             frame = render_frame(scene, plan, previous=frame)
             for channel in frame.keys():
                 frame.device_array(channel)
     names = sorted({name.rpartition(".")[0] for name, _ in launches})
-    return names, (launch.loading_ms() - before) / 1000.0
+    return plan, names, (launch.loading_ms() - before) / 1000.0
 
 
 def warm_all(device: wp.DeviceLike, threads: int = 0) -> tuple[list[str], float]:
