@@ -138,6 +138,8 @@ class Settings:
     local_rays: str = "exact"
     """Depths of local maps: `exact` (rays through the triangles, at the nodes of a mesh), or `field` (the field of what never
     moves, `field_kind`)."""
+    local_shade_step: int = 1
+    """What is shaded in local maps: squares of so many texels that show one triangle share what one of them sees; 1: none do."""
     mesh_cells: int = 32
     """Cells along a face of a local map's mesh before it is refined, at least."""
     depth_ratio: float = 0.25
@@ -260,6 +262,7 @@ class Settings:
         _require(1 <= self.rem_limit <= 1024, "rem_limit", self.rem_limit, "1 to 1024")
         _require(0.0 <= self.rem_error_px <= 1.0e6, "rem_error_px", self.rem_error_px, "a number of texels")
         _require(self.local_rays in LOCAL_RAYS, "local_rays", self.local_rays, f"one of {', '.join(LOCAL_RAYS)}")
+        _require(1 <= self.local_shade_step <= 16, "local_shade_step", self.local_shade_step, "1 to 16 texels")
         _require(1 <= self.mesh_cells <= 4096, "mesh_cells", self.mesh_cells, "1 to 4096")
         _require(0.0 <= self.depth_ratio <= 1.0e6, "depth_ratio", self.depth_ratio, "0 (all texels) or a ratio")
         _require(0 <= self.parallax_steps <= 64, "parallax_steps", self.parallax_steps, "0 to 64")

@@ -389,11 +389,19 @@ def shaded_hits_kernel(
 
 @wp.kernel
 def put_radiance_kernel(
-    first: int, texel: wp.array(dtype=int), radiance: wp.array(dtype=wp.vec3), out_radiance: wp.array(dtype=wp.vec4)
+    first: int,
+    texel: wp.array(dtype=int),
+    source: wp.array(dtype=int),
+    radiance: wp.array(dtype=wp.vec3),
+    out_radiance: wp.array(dtype=wp.vec4),
 ):
-    """One thread per texel that was shaded; a value that is not finite is black."""
+    """One thread per texel that shows what was shaded, `source`, or its own; a value that is not finite is black."""
     i = first + wp.tid()
-    r = radiance[i]
+    r = wp.vec3(0.0, 0.0, 0.0)
+    if source.shape[0] > 0:
+        r = radiance[source[i]]
+    else:
+        r = radiance[i]
     if not (wp.isfinite(r[0]) and wp.isfinite(r[1]) and wp.isfinite(r[2])):
         r = wp.vec3(0.0, 0.0, 0.0)
     out_radiance[texel[i]] = wp.vec4(r[0], r[1], r[2], 1.0)
@@ -466,8 +474,15 @@ def blend_local_map(
 def shade_texels(
     scene: Scene, local: CubeMaps, texels: np.ndarray, settings: Settings, onward: Onward | None = None
 ) -> None:
-    """Shade texels (flat indices) where they lie: at their distances, on their triangles; mirrors show what `onward` has."""
-    device, count, n = scene.device, len(texels), local.resolution
+    """Shade texels (flat indices) where they lie: at their distances, on their triangles; mirrors show what `onward` has.
+
+    Squares of `local_shade_step` texels that show one triangle share what one of them sees.
+    """
+    device, n = scene.device, local.resolution
+    shown, source = texels, np.zeros(0, np.int32)
+    if settings.local_shade_step > 1:
+        texels, source = _sharing(texels, local.view.triangle.numpy(), n, settings.local_shade_step)
+    count = len(texels)
     texel = wp.array(texels.astype(np.int32), dtype=int, device=device)
     point, direction = (wp.empty(count, dtype=wp.vec3, device=device) for _ in range(2))
     u, v = (wp.empty(count, dtype=float, device=device) for _ in range(2))
@@ -484,4 +499,22 @@ def shade_texels(
     )
     if onward is not None:
         onward(gbuffer, layer, radiance)
-    launch.launch(put_radiance_kernel, count, [texel, radiance, local.view.radiance], device, settings.threads)
+    shown, source = (wp.array(each.astype(np.int32), dtype=int, device=device) for each in (shown, source))
+    inputs = [shown, source, radiance, local.view.radiance]
+    launch.launch(put_radiance_kernel, len(shown), inputs, device, settings.threads)
+
+
+def _sharing(texels: np.ndarray, triangle: np.ndarray, n: int, step: int) -> tuple[np.ndarray, np.ndarray]:
+    """(Those of some texels that are shaded; for each the number, among these, of the one whose shading it shows)."""
+    line, column = np.divmod(texels, n)  # lines of all faces below one another
+    row = line % n
+    middle = step // 2
+    asked = texels + (np.minimum(row // step * step + middle, n - 1) - row) * n
+    asked += np.minimum(column // step * step + middle, n - 1) - column
+    place = np.full(FACE_COUNT * n * n, -1, np.int32)
+    place[texels] = np.arange(len(texels), dtype=np.int32)
+    other = place[asked]
+    other = np.where((other >= 0) & (triangle[asked] == triangle[texels]), other, place[texels])
+    own = other == place[texels]
+    number = np.cumsum(own, dtype=np.int32) - 1
+    return texels[own], number[other]

@@ -55,7 +55,7 @@ class DepthMesh:
 
     def trace(self, texels: np.ndarray, intersect: Intersect) -> np.ndarray:
         """Give texels (flat indices, each once) rays of their own; returns their inverse distances, 0 sky, float32."""
-        axis_directions, lengths = _texel_rays(self.inverse.shape[1])
+        axis_directions, lengths = texel_rays(self.inverse.shape[1])
         length = lengths[texels]
         distance, triangle = intersect(axis_directions[texels] / length[:, None])
         with np.errstate(divide="ignore", over="ignore"):
@@ -70,7 +70,7 @@ class DepthMesh:
 
 
 @cache
-def _texel_rays(resolution: int) -> tuple[np.ndarray, np.ndarray]:
+def texel_rays(resolution: int) -> tuple[np.ndarray, np.ndarray]:
     """Directions of a map's texels at length 1 along their face's axis, float32 [6 n n, 3], and their lengths."""
     directions = texel_directions(resolution).reshape(-1, 3)
     return directions.astype(np.float32), np.linalg.norm(directions, axis=1).astype(np.float32)
