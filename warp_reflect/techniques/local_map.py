@@ -22,7 +22,7 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from warp_reflect import launch, shade
+from warp_reflect import launch, shade, vector
 from warp_reflect.cubemap import FACE_COUNT, radiance_direction
 from warp_reflect.environment_maps import (
     CubeMaps,
@@ -46,6 +46,7 @@ from warp_reflect.techniques.local_mesh import DepthMesh, Intersect
 wp.set_module_options({"enable_backward": False})
 
 REMS_MAX = 8  # maps that a local map may look at
+ROW_MULTIPLE = 16  # texels: no vector of them goes over the end of a row
 RemWeights = wp.types.vector(length=REMS_MAX, dtype=wp.float32)
 
 # The depth test's slack: texels' footprint on the surface, and rounding (algorithms: 0.3 to 2 % of the visible fail it).
@@ -236,6 +237,7 @@ def blend_texel(
     eye: wp.vec3,
     slack: float,
     blur_max: float,
+    shaded: int,
     resolution: int,
     i: int,
     inverse: wp.array(dtype=float),
@@ -283,11 +285,14 @@ def blend_texel(
     k = int(0)
     while k < asked:
         ray = p - maps.centre[rems[k]]
-        if wp.dot(ray, ray) > AT_CENTRE * distance * distance and sees_point(maps, rems[k], p, normal, off):
-            if blur_max == 0.0 or blur(maps, rems[k], p, normal, eye, n) <= blur_max:
+        if blur_max == 0.0 or blur(maps, rems[k], p, normal, eye, n) <= blur_max:
+            if wp.dot(ray, ray) > AT_CENTRE * distance * distance and sees_point(maps, rems[k], p, normal, off):
                 valid[k] = 1.0
                 any_valid = int(1)
         k += 1
+    out_state[i] = wp.uint8(wp.where(any_valid == 1, TEXEL_BLENDED, TEXEL_MISSING))
+    if any_valid == 0 and shaded == 1 and triangle[i] >= 0:
+        return
     weights = rem_weights(maps, rems, used, eye, p, valid)
     total = wp.vec3(0.0, 0.0, 0.0)
     k = int(0)
@@ -303,7 +308,6 @@ def blend_texel(
             total += weights[k] * seen
         k += 1
     out_radiance[i] = wp.vec4(total[0], total[1], total[2], 1.0)
-    out_state[i] = wp.uint8(wp.where(any_valid == 1, TEXEL_BLENDED, TEXEL_MISSING))
 
 
 @wp.kernel
@@ -317,6 +321,7 @@ def blend_kernel(
     eye: wp.vec3,
     slack: float,
     blur_max: float,
+    shaded: int,
     resolution: int,
     index: wp.array(dtype=int),
     inverse: wp.array(dtype=float),
@@ -326,7 +331,7 @@ def blend_kernel(
     out_distance: wp.array(dtype=float),
     out_state: wp.array(dtype=wp.uint8),
 ):
-    """One thread per texel; where `index` has a length, of those."""
+    """One thread per texel; where `index` has a length, of those. `shaded`: what no map sees is shaded afterwards."""
     i = first + wp.tid()
     if index.shape[0] > 0:
         i = index[i]
@@ -339,6 +344,7 @@ def blend_kernel(
         eye,
         slack,
         blur_max,
+        shaded,
         resolution,
         i,
         inverse,
@@ -407,6 +413,11 @@ def put_radiance_kernel(
     out_radiance[texel[i]] = wp.vec4(r[0], r[1], r[2], 1.0)
 
 
+def vector_fits(resolution: int, used: int, rem_count: int) -> bool:
+    """Whether blocks of texels are blended at once: rows of whole vectors, and one or two maps."""
+    return resolution % ROW_MULTIPLE == 0 and min(used, rem_count) <= 2
+
+
 def blend_local_map(
     scene: Scene,
     centre: np.ndarray,
@@ -443,13 +454,24 @@ def blend_local_map(
     eye = wp.vec3(*(centre - scene.origin))
     chosen = wp.array(np.asarray(rems, np.int32), dtype=int, device=device)
 
+    by_blocks = vector.chosen(settings.kernels, device) and vector_fits(n, settings.rem_count, len(rems))
+
     def blend(texels: np.ndarray | None) -> None:
         local.view.triangle = wp.array(mesh.triangle.reshape(-1), dtype=int, device=device)
         inverse = wp.array(mesh.inverse.reshape(-1), dtype=float, device=device)
+        light, looked_at = [scene.lights, maps.view, chosen, settings.rem_count, eye], [inverse, local.view.triangle]
+        knobs = [float(slack), settings.rem_blur_px, int(settings.rem_missing == "shade"), n]
+        outputs = [local.view.radiance, local.view.distance, state]
+        if texels is None and by_blocks:
+            from warp_reflect.techniques.local_map_vector import (
+                blend_blocks_kernel,
+            )  # which uses this module's functions
+
+            inputs = [scene.view, scene.triangle_records, *light, *knobs, *looked_at, *outputs]
+            vector.launch_blocks(blend_blocks_kernel, len(state), inputs, device, threads)
+            return
         index = wp.array(np.zeros(0, np.int32) if texels is None else texels, dtype=int, device=device)
-        inputs = [scene.view, scene.lights, maps.view, chosen, settings.rem_count, eye]
-        inputs += [float(slack), settings.rem_blur_px, n, index]
-        inputs += [inverse, local.view.triangle, local.view.radiance, local.view.distance, state]
+        inputs = [scene.view, *light, *knobs, index, *looked_at, *outputs]
         launch.launch(blend_kernel, len(state) if texels is None else len(texels), inputs, device, threads)
 
     blend(None)
