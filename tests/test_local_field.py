@@ -12,9 +12,10 @@ from stage_samples import saved
 from test_layered_environment import plan_of
 
 import warp_reflect as wr
+from warp_reflect import launch
 from warp_reflect.cubemap import texel_directions
 from warp_reflect.scene import Scene
-from warp_reflect.techniques import layered_environment, local_field
+from warp_reflect.techniques import layered_environment, local_field, local_map
 
 SETTINGS = wr.Settings(
     environment_resolution=32, local_rays="field", field_cell=0.25, field_kind="heightfield", bounces=1
@@ -100,6 +101,16 @@ def test_a_mirror_shows_the_same_by_a_field(scene):
     assert np.isfinite(frame["RGBA"]).all() and off.mean() < 0.03 and np.median(off) < 0.005
 
 
+@pytest.mark.parametrize("rays", ["field", "exact"])
+def test_without_a_field_nothing_of_it_is_launched_or_kept(scene, rays):
+    fresh = Scene(scene.data, "cpu")
+    with launch.recorded() as launches:
+        layered_environment.prepare(fresh, Named(ball(fresh)), SETTINGS.replace(local_rays=rays))
+    asked = any("local_field" in name for name, _ in launches)
+    kept = any(key[0] == layered_environment.FIELD_KEY for key in fresh.environments)
+    assert asked == kept == (rays == "field")
+
+
 def test_fields_are_handed_over_in_time(scene):
     known = local_field.local_field(scene, SETTINGS)
     later = scene.at(3.0)
@@ -116,3 +127,43 @@ def test_fields_are_handed_over_in_time(scene):
 def test_values_that_cannot_be_are_refused():
     with pytest.raises(ValueError, match="local_rays"):
         wr.Settings(local_rays="none")
+
+
+@pytest.mark.parametrize("settings", [{}, {"rem_missing": "best", "rem_blur_px": 0.0}, {"rem_texels": "packed"}])
+@pytest.mark.parametrize("rays", ["field", "exact"])
+def test_blocks_of_texels_are_blended_as_single_ones(scene, rays, settings):
+    """Bit for bit but for distances, of another product's order: 2 ulp."""
+    common = SETTINGS.replace(**{"rem_texels": "full", "local_rays": rays} | settings)
+    part = ball(scene)
+    maps = [layered_environment.prepare(scene, Named(part), common.replace(kernels=k)) for k in ("plain", "auto")]
+    states, colours, depths = (
+        [get(each) for each in maps]
+        for get in (lambda m: m.state.numpy(), lambda m: m.local.radiance(0), lambda m: m.local.distance(0))
+    )
+    assert (states[0] != states[1]).mean() < 1e-3
+    same = (states[0] == states[1]).reshape(colours[0].shape[:3])
+    np.testing.assert_allclose(colours[0][same], colours[1][same], atol=2e-5)
+    np.testing.assert_allclose(depths[0], depths[1], rtol=3e-7)
+    np.testing.assert_array_equal(maps[0].local.triangle(0), maps[1].local.triangle(0))
+
+
+class Named:
+    def __init__(self, part: int):
+        self.part = part
+
+
+def test_shading_that_squares_share_is_that_of_one_of_them(scene):
+    part = ball(scene)
+    one, four = (
+        layered_environment._still_map(scene, part, SETTINGS.replace(rem_blur_px=0.5, local_shade_step=step))
+        for step in (1, 4)
+    )
+    np.testing.assert_array_equal(one.state.numpy(), four.state.numpy())
+    shaded = (one.state.numpy() == local_map.TEXEL_SHADED).reshape(6, 32, 32)
+    assert shaded.sum() > 500
+    off = np.abs(one.local.radiance(0) - four.local.radiance(0)).max(-1)
+    assert not off[~shaded].any() and 0.0 < off[shaded].mean() < 0.05
+    triangle, colours = four.local.triangle(0), four.local.radiance(0)
+    square = (slice(0, 1), slice(4, 8), slice(8, 12))
+    alike = shaded[square] & (triangle[square] == triangle[0, 6, 10])
+    assert len(np.unique(colours[square][alike], axis=0)) <= 1

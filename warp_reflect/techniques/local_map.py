@@ -19,6 +19,8 @@ the texel in the direction of I is blended from the REMs that see I. Differs fro
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import warp as wp
 
@@ -528,15 +530,20 @@ def shade_texels(
 
 def _sharing(texels: np.ndarray, triangle: np.ndarray, n: int, step: int) -> tuple[np.ndarray, np.ndarray]:
     """(Those of some texels that are shaded; for each the number, among these, of the one whose shading it shows)."""
-    line, column = np.divmod(texels, n)  # lines of all faces below one another
-    row = line % n
-    middle = step // 2
-    asked = texels + (np.minimum(row // step * step + middle, n - 1) - row) * n
-    asked += np.minimum(column // step * step + middle, n - 1) - column
+    own = np.arange(len(texels), dtype=np.int32)
     place = np.full(FACE_COUNT * n * n, -1, np.int32)
-    place[texels] = np.arange(len(texels), dtype=np.int32)
+    place[texels] = own
+    asked = _middles(n, step)[texels]
     other = place[asked]
-    other = np.where((other >= 0) & (triangle[asked] == triangle[texels]), other, place[texels])
-    own = other == place[texels]
-    number = np.cumsum(own, dtype=np.int32) - 1
-    return texels[own], number[other]
+    other = np.where((other >= 0) & (triangle[asked] == triangle[texels]), other, own)
+    shaded = other == own
+    number = np.cumsum(shaded, dtype=np.int32) - 1
+    return texels[shaded], number[other]
+
+
+@cache
+def _middles(n: int, step: int) -> np.ndarray:
+    """For each texel of a map the middle one of its square, int32 [6 n n]."""
+    line = np.minimum(np.arange(n) // step * step + step // 2, n - 1)
+    face = np.arange(FACE_COUNT)[:, None, None] * n
+    return ((face + line[None, :, None]) * n + line[None, None, :]).reshape(-1).astype(np.int32)
