@@ -12,7 +12,7 @@ from stage_samples import saved
 from test_layered_environment import plan_of
 
 import warp_reflect as wr
-from warp_reflect import launch
+from warp_reflect import kernels, launch
 from warp_reflect.cubemap import texel_directions
 from warp_reflect.scene import Scene
 from warp_reflect.techniques import layered_environment, local_field, local_map
@@ -124,9 +124,14 @@ def test_fields_are_handed_over_in_time(scene):
     assert np.median(np.abs(got - true)[(true > 0) & (got > 0)]) < 1e-3
 
 
-def test_values_that_cannot_be_are_refused():
-    with pytest.raises(ValueError, match="local_rays"):
-        wr.Settings(local_rays="none")
+@pytest.mark.parametrize(("name", "value"), [("local_rays", "none"), ("local_shade_step", 0), ("local_shade_step", 17)])
+def test_values_that_cannot_be_are_refused(name, value):
+    with pytest.raises(ValueError, match=name):
+        wr.Settings(**{name: value})
+
+
+def test_what_is_compiled_ahead_is_what_fits_vectors():
+    assert kernels.ROW_MULTIPLE == local_map.ROW_MULTIPLE
 
 
 @pytest.mark.parametrize("settings", [{}, {"rem_missing": "best", "rem_blur_px": 0.0}, {"rem_texels": "packed"}])
