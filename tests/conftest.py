@@ -24,6 +24,7 @@ BOUNDS = {
     "test_frost.py": ("test_frost_is_finite", "test_what_a_mirror_shows_fades"),
     "test_glossy.py": (
         "test_plane_shows_the_lobe_over_a_known_sky[filter-0.15",
+        "test_plane_shows_the_lobe_over_a_known_sky[gather-0.15",
         "test_nothing_gives_more_light_than_it_gets[0.3-accumulate",
     ),
     "test_grid.py": ("test_answers_that_are_there_already_are_kept",),

@@ -110,7 +110,7 @@ def test_smooth_mirrors_run_nothing_of_it(device, monkeypatch):
     assert names and not [n for n in names if "turn_rays" in n or "mix_coat" in n or "eye_normals" in n]
 
 
-@pytest.mark.parametrize("glossy", ["filter", "accumulate"])
+@pytest.mark.parametrize("glossy", ["gather", "filter", "accumulate"])
 def test_coat_over_a_rough_base_is_two_mirrors(glossy):
     """A plane under a known sky: the coat's sharp share of it and the base's lobe of what that leaves."""
     f0, coat, roughness = 0.6, 0.8, 0.3

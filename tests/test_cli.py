@@ -543,7 +543,11 @@ def test_warmup_knows_every_kernel_module():
     from warp_reflect.warmup import kernel_modules
 
     names = set(kernel_modules())
-    assert {"warp_reflect.raster", "warp_reflect.techniques.refine_vector", "warp_reflect.finishes.glossy"} <= names
+    assert {
+        "warp_reflect.raster",
+        "warp_reflect.techniques.refine_vector",
+        "warp_reflect.finishes.glossy_gather",
+    } <= names
     assert not names & {"warp_reflect.cli", "warp_reflect.settings", "warp_reflect.planner"}
 
 

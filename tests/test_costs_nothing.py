@@ -90,8 +90,14 @@ CASES = {
     "second_bounce": Case(settings={"bounces": 2}, others=CHROME, owns=("bounces",), twin={"others": MATT}),
     "roughness": Case(
         mirror=dataclasses.replace(CHROME, roughness=0.2),
-        owns=("finishes.glossy", "finishes.layer_map"),
+        owns=("finishes.glossy_gather", "finishes.glossy_rays"),
         twin={"mirror": CHROME},
+    ),
+    "roughness looked up": Case(
+        settings={"glossy": "filter"},
+        mirror=dataclasses.replace(CHROME, roughness=0.2),
+        owns=("finishes.glossy_filter", "finishes.layer_map"),
+        twin={"settings": {}},
     ),
     "clearcoat": Case(
         mirror=dataclasses.replace(CHROME, roughness=0.2, clearcoat=1.0, clearcoat_roughness=0.02),

@@ -69,7 +69,7 @@ REM_MISSING = ("shade", "best")
 ENVIRONMENT_UPDATES = ("static", "frame", "previous")
 FIELDS = ("auto", "heightfield", "occupancy")
 BUMPS = ("lookup", "traced", "off")
-GLOSSY = ("filter", "accumulate", "off")
+GLOSSY = ("gather", "filter", "accumulate", "off")
 KERNELS = ("auto", "plain", "vector")
 WAVES = ("lookup", "traced", "off")
 
@@ -205,10 +205,15 @@ class Settings:
     bumps: str = "traced"
     """Normal maps of mirrors: `traced` follows every turned ray, `lookup` looks it up in the smooth picture first,
     `off` reflects at the surface itself."""
-    glossy: str = "filter"
-    """Rough mirrors: `filter` (look-ups in the sharp picture), `accumulate` (rays of the lobe: the reference), or `off`."""
+    glossy: str = "gather"
+    """Rough mirrors: `gather` (a few rays of the lobe a pixel, shared by neighbours), `filter` (look-ups in the sharp picture),
+    `accumulate` (rays of the lobe: the reference), or `off`."""
     glossy_samples: int = 0
-    """Look-ups or rays a pixel of a rough mirror; 0: the method's own (filter 16, accumulate 256)."""
+    """Look-ups or rays a pixel of a rough mirror; 0: the method's own (gather 6, filter 16, accumulate 256)."""
+    glossy_neighbours: int = 16
+    """`glossy=gather`: pixels around one whose rays it shares, where their lobes overlap its own; 0: it has but its own."""
+    glossy_smooth: float = 0.3
+    """`glossy=gather`: grain is smoothed over pixels that see the same up to this share of their lobes' width; 0: it is left."""
     glossy_min_roughness: float = 0.01
     """A mirror up to this roughness is shown sharp; a lobe of 0.01 is a fifth of a pixel wide at a focal length of 1000."""
     reflector_max_roughness: float = 0.3
@@ -288,6 +293,8 @@ class Settings:
         _require(self.bumps in BUMPS, "bumps", self.bumps, f"one of {', '.join(BUMPS)}")
         _require(self.glossy in GLOSSY, "glossy", self.glossy, f"one of {', '.join(GLOSSY)}")
         _require(0 <= self.glossy_samples <= 65536, "glossy_samples", self.glossy_samples, "0 (its own) to 65536")
+        _require(0 <= self.glossy_neighbours <= 256, "glossy_neighbours", self.glossy_neighbours, "0 to 256 pixels")
+        _require(0.0 <= self.glossy_smooth <= 1.0, "glossy_smooth", self.glossy_smooth, "0 (off) to 1")
         _require(0.0 <= self.glossy_min_roughness <= 1.0, "glossy_min_roughness", self.glossy_min_roughness, "0 to 1")
         _require(self.kernels in KERNELS, "kernels", self.kernels, f"one of {', '.join(KERNELS)}")
         _require(0 <= self.threads <= 1024, "threads", self.threads, "0 (all cores) to 1024")

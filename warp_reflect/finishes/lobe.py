@@ -13,6 +13,7 @@ import warp as wp
 
 from warp_reflect.optics import tangent_basis
 from warp_reflect.scene import SceneView
+from warp_reflect.shade import schlick
 from warp_reflect.shapes import unit
 from warp_reflect.textures import Look, plain_look
 
@@ -20,10 +21,14 @@ wp.set_module_options({"enable_backward": False})
 
 PI = wp.constant(3.141592653589793)
 GOLDEN = wp.constant(0.6180339887498949)  # (sqrt(5) - 1) / 2, the slope of a Fibonacci lattice
+# Of the shift from pixel to pixel, right and down: the least of 10,000 in the L2 discrepancy around the square (Hickernell, A
+# Generalized Discrepancy and Quadrature Error Bound, Math. Comp. 1998) of the lattices of 2x2 to 7x7 pixels, 1 to 8 points each.
+SHIFT = wp.constant(wp.mat22(0.42302, 0.69520, 0.73080, 0.58289))
 # Smallest alpha: below it a lobe is narrower than the rounding of a direction. Roughness 0.003.
 LEAST_ALPHA = wp.constant(1.0e-5)
 # A viewer below this cosine would see none of the lobe's microfacets at a finite density.
 LEAST_COSINE = wp.constant(1.0e-4)
+LEAST_WEIGHT = wp.constant(1.0e-6)  # of a mirror, that a lobe is put in relation to
 
 
 @wp.struct
@@ -93,6 +98,14 @@ def pixel_shift(pixel: int) -> wp.vec2:
 
 
 @wp.func
+def even_shift(x: int, y: int) -> wp.vec2:
+    """A shift of the lattice that differs most between pixels close by: their points together are spread evenly too."""
+    u = SHIFT[0, 0] * float(x) + SHIFT[0, 1] * float(y)
+    v = SHIFT[1, 0] * float(x) + SHIFT[1, 1] * float(y)
+    return wp.vec2(u - wp.floor(u), v - wp.floor(v))
+
+
+@wp.func
 def lobe_sample(alpha: float, n: wp.vec3, view: wp.vec3, point: wp.vec2) -> LobeSample:
     """A reflected direction drawn in proportion to the microfacets that the viewer sees.
 
@@ -132,4 +145,68 @@ def lobe_sample(alpha: float, n: wp.vec3, view: wp.vec3, point: wp.vec2) -> Lobe
     result.weight = seen / (seen + smith(out, alpha))
     # Density of directions: D G1 / (4 n.v), D = 1 / (pi alpha^2 shape^2), G1 = 1 / seen.
     result.solid_angle = 4.0 * vz * seen * PI * alpha * alpha * shape * shape
+    return result
+
+
+@wp.func
+def lobe_value(alpha: float, n: wp.vec3, view: wp.vec3, direction: wp.vec3) -> LobeSample:
+    """A given direction as a sample of a lobe, see `lobe_sample`; weight 0 where it could not be one.
+
+    Args:
+        alpha: Of the lobe, > 0.
+        n: Unit normal.
+        view: Unit direction to the viewer, on the normal's side.
+        direction: Unit.
+    """
+    result = LobeSample()
+    result.direction = direction
+    out = wp.dot(direction, n)
+    across = direction + view
+    length = wp.length(across)
+    if out <= 0.0 or length == 0.0:
+        return result
+    h = across / length
+    result.half = h
+    hz = wp.dot(h, n)
+    flat = (h - hz * n) / alpha
+    shape = hz * hz + wp.dot(flat, flat)
+    vz = wp.max(wp.dot(view, n), LEAST_COSINE)
+    seen = 1.0 + smith(vz, alpha)
+    result.cosine = wp.clamp(wp.dot(view, h), 0.0, 1.0)
+    result.weight = seen / (seen + smith(out, alpha))
+    result.solid_angle = 4.0 * vz * seen * PI * alpha * alpha * shape * shape
+    return result
+
+
+@wp.func
+def eye_side(direction: wp.vec3, n: wp.vec3) -> wp.vec3:
+    """Unit direction back to the eye from a sharp reflection and the normal it was reflected at."""
+    return 2.0 * wp.dot(direction, n) * n - direction
+
+
+@wp.func
+def outward(direction: wp.vec3, n: wp.vec3) -> wp.vec3:
+    """A direction out of the surface: what a normal map sends into it is reflected once more."""
+    into = wp.min(wp.dot(direction, n), 0.0)
+    return direction - 2.0 * into * n
+
+
+@wp.func
+def share_of_weight(lobe: Lobe, cosine: float, total: wp.vec3, seen: wp.vec3, given: wp.vec3) -> wp.vec3:
+    """Radiance that, times a sharp mirror's weight, is what a lobe reflects.
+
+    Args:
+        lobe: Its F0 and F90.
+        cosine: Of the angle of incidence on the surface.
+        total: Mean of all directions' weights.
+        seen: Sum of the weights of those whose radiance is known, times that.
+        given: Sum of their weights.
+    """
+    sharp = schlick(lobe.f0, lobe.f90, cosine)
+    result = wp.vec3(0.0, 0.0, 0.0)
+    for c in range(3):
+        if given[c] > 0.0:
+            result[c] = seen[c] / given[c]
+            if sharp[c] > LEAST_WEIGHT:
+                result[c] *= wp.min(total[c] / sharp[c], 1.0)
     return result

@@ -94,7 +94,7 @@ POSITIONS = {
     "refine": (),
     "search": (),
     "glossy": (),
-    "glossy_samples": (0, 4, 8, 16, 32, 64, 128, 256),
+    "glossy_samples": (0, 2, 4, 6, 8, 16, 32, 64, 128, 256),
     "rem_count": (1, 2, 3, 4, 6, 8),
     "tolerance": (0.0, 1.0e-6, 1.0e-5, 1.0e-4, 1.0e-3, 1.0e-2, 0.1),
 }
