@@ -78,7 +78,7 @@ def test_cutting_large_triangles_brings_their_picture_closer():
 
 
 def test_lattice_tiles_its_triangle():
-    weights, triangles = virtual_mesh._lattice(8)
+    weights, triangles = virtual_mesh.lattice_of(8)
     assert len(triangles) == 64
     corner = weights[triangles] * [0.0, 1.0, 1.0]
     area = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])

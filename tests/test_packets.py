@@ -278,6 +278,41 @@ def test_shadows_are_found_bit_for_bit_as_the_plain_kernels_find_them(samples):
         np.testing.assert_array_equal(got, sky)
 
 
+def test_lights_are_tried_one_by_one_bit_for_bit_as_the_plain_kernel_tries_them():
+    scene, _ = lit_balls()
+    camera = look_at((0, 1.0, 4.0), (0, 0.8, 0), fov=60, size=(67, 43))
+    points = direct.points_of(scene, raster.draw_scene(scene, camera))
+    plain = shadows.light_shares(scene, points, 16, 1, kernels="plain")
+    assert 0.1 < plain[2].mean() < 0.95 and (points.triangle.numpy() < 0).any()
+    for threads in (1, 2):
+        for got, expected in zip(
+            shadows.light_shares(scene, points, 16, threads, kernels="vector"), plain, strict=True
+        ):
+            np.testing.assert_array_equal(got, expected)
+
+
+@pytest.mark.parametrize("method", ["raytraced", "auto"])
+def test_mirrors_show_the_same_points_whichever_kernels_follow_their_rays(method):
+    """A concave mirror whose rays go on past its own facets, and mirrors that see each other."""
+    silver = MaterialData(base_color=(1, 1, 1), metallic=1.0, roughness=0.0)
+    inside_out = ball_mesh()
+    placed = [(ground(), place(), WHITE), (ball_mesh(), place(0.8, 0.6, 0, 0.5), silver)]
+    placed += [(inside_out, place(0, 1.0, -1, 3.0), silver), (ball_mesh(), place(-0.8, 0.5, 1, 0.4), WHITE)]
+    scene = scene_of(placed, LIGHTS[:1])
+    camera = look_at((0, 1.2, 1.5), (0, 0.6, 0), fov=60, size=(120, 80))
+    layers = []
+    for kernels, threads in (("plain", 1), ("vector", 1), ("vector", 2)):
+        settings = wr.Settings(kernels=kernels, threads=threads, shadows=False, bounces=2)
+        plan = wr.make_plan(scene, camera, size=camera.size, settings=settings, method=method)
+        frame = wr.render_frame(scene, plan)
+        found = [frame[name] for name in ("reflectedId", "reflectedPoint", "pathLength", "status", "RGBA")]
+        layers.append(found)
+    assert (layers[0][0] > 0).sum() > 2000
+    for other in layers[1:]:
+        for got, expected in zip(other, layers[0], strict=True):
+            np.testing.assert_array_equal(got, expected)
+
+
 def test_a_mirror_shows_the_same_shadows_bit_for_bit():
     """What a mirror shows are points of some pixels only."""
     scene, camera = lit_balls(MaterialData(base_color=(1, 1, 1), metallic=1.0, roughness=0.0))

@@ -143,6 +143,7 @@ def onward(
     bounces: int,
     threads: int = 0,
     forward: Callable[[ReflectionLayer, wp.array], None] | None = None,
+    kernels: str = "auto",
 ) -> wp.array:
     """What a layer's rays see, with what the mirrors among it reflect.
 
@@ -156,6 +157,7 @@ def onward(
         bounces: Reflections that are followed from there on.
         threads: CPU threads; 0: one per core.
         forward: Answers some of the first rays that mirrors reflect, and leaves the status of others NONE; None: rays do.
+        kernels: `Settings.kernels`.
 
     Returns:
         vec3 [n]; `seen` itself where no mirror is met. The layer's statistics get `bounced`: rays followed, and
@@ -191,16 +193,18 @@ def onward(
         layer = ReflectionLayer.empty(pixels, Technique.RAYTRACED, device)
         if forward is not None and depth == 0:
             forward(layer, facet)
-            _trace_others(scene, layer, facet, bodies, threads)
+            _trace_others(scene, layer, facet, bodies, threads, kernels)
             add_statistics(first.statistics, layer.statistics)
         else:
-            bvh.trace_bounced(scene, layer, facet, bodies, threads)
+            bvh.trace_bounced(scene, layer, facet, bodies, threads, kernels)
         numbers = wp.array(index, dtype=int, device=device)
         launch.launch(add_bounce_kernel, len(going), [numbers, weight, domes, met(layer), total], device, threads)
     return total
 
 
-def _trace_others(scene: Scene, layer: ReflectionLayer, facet: wp.array, bodies: wp.array, threads: int) -> None:
+def _trace_others(
+    scene: Scene, layer: ReflectionLayer, facet: wp.array, bodies: wp.array, threads: int, kernels: str
+) -> None:
     """Trace the rays of a layer whose status is NONE."""
     others = np.flatnonzero(layer.status.numpy() == int(Status.NONE))
     if not len(others):
@@ -211,7 +215,7 @@ def _trace_others(scene: Scene, layer: ReflectionLayer, facet: wp.array, bodies:
         for array in (pixels.pixel, pixels.point, pixels.normal, pixels.direction, facet)
     ]
     rest = ReflectionLayer.empty(MirrorPixels(pixels.reflector, *some[:4], pixels.box), layer.method, scene.device)
-    bvh.trace_bounced(scene, rest, some[4], bodies, threads)
+    bvh.trace_bounced(scene, rest, some[4], bodies, threads, kernels)
     for name in ("triangle", "u", "v", "distance", "status"):
         host = getattr(layer, name).numpy()
         host[others] = getattr(rest, name).numpy()

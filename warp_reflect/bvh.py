@@ -12,7 +12,7 @@ import copy
 import numpy as np
 import warp as wp
 
-from warp_reflect import launch
+from warp_reflect import launch, vector
 from warp_reflect.launch import FINITE_FLAGS
 from warp_reflect.layers import GBuffer, MirrorPixels, ReflectionLayer
 from warp_reflect.scene import Scene, SceneView
@@ -57,6 +57,17 @@ class RayHit:
     u: float  # weights of the triangle's second and third corner
     v: float
     status: int  # CONVERGED, SKY or STEP_LIMIT
+
+
+@wp.struct
+class Met:
+    """What a ray's first query finds: of Warp, or of a packet (`bvh_vector.py`)."""
+
+    known: int  # 0: not asked yet
+    triangle: int  # -1: none
+    t: float  # in lengths of the direction
+    first: float  # weights of the triangle's first and second corner
+    second: float
 
 
 @wp.struct
@@ -161,7 +172,33 @@ def exact_hit(
 
 
 @wp.func
-def trace_ray(
+def ask(mesh_id: wp.uint64, origin: wp.vec3, direction: wp.vec3) -> Met:
+    """Warp's answer."""
+    met = Met()
+    met.triangle = -1
+    query = wp.mesh_query_ray(mesh_id, origin, direction, FAR)
+    if query.result:
+        met.triangle = query.face
+        met.t = query.t
+        met.first = query.u
+        met.second = query.v
+    return met
+
+
+@wp.func
+def answered(known: int, triangle: int, u: float, v: float, t: float) -> Met:
+    """What `bvh_vector.first_met` has left in a ray's outputs, if it was asked."""
+    met = Met()
+    met.known = known
+    met.triangle = triangle
+    met.t = t
+    met.first = u
+    met.second = v
+    return met
+
+
+@wp.func
+def trace_ray_from(
     mesh_id: wp.uint64,
     scene: SceneView,
     # Ray:
@@ -174,6 +211,7 @@ def trace_ray(
     # Settings:
     retry: int,
     t_first: float,
+    known: Met,
 ) -> RayHit:
     """First surface along a ray that starts on a surface or in free space.
 
@@ -188,6 +226,7 @@ def trace_ray(
         body: The mirror around it. A convex one is stepped over, of others what the ray leaves from behind.
         retry: 1: a ray that finds nothing is asked once more, turned by a few ulp.
         t_first: What is nearer is not met.
+        known: What is met first where t_first is 0, if that was asked before.
 
     Returns:
         The hit; t, u and v are those of `intersect_triangle` from the origin itself, clamped to the triangle.
@@ -207,17 +246,19 @@ def trace_ray(
     # A range over the constant would be unrolled, eight traversals long.
     while step < MAX_STEPS:
         step += 1
-        query = wp.mesh_query_ray(mesh_id, start + t0 * d, d, FAR)
-        if not query.result:
+        met = known
+        if known.known == 0 or step > 1:
+            met = ask(mesh_id, start + t0 * d, d)
+        if met.triangle < 0:
             if retry == 0 or asked != 0:
                 return result
             asked = int(1)
             d = moved_direction(d)
         else:
-            triangle = query.face
+            triangle = met.triangle
             if body.alone != 0:
                 triangle += body.first_triangle
-            t = t0 + query.t
+            t = t0 + met.t
             step_over = triangle == facet
             if triangle >= body.first_triangle and triangle < body.first_triangle + body.triangle_count:
                 if body.convex != 0:
@@ -225,10 +266,29 @@ def trace_ray(
                 elif not step_over:
                     step_over = leaves_from_behind(scene, triangle, t, d, normal, facet)
             if not step_over:
-                return exact_hit(scene, triangle, origin, direction, t, query.u, query.v)
+                return exact_hit(scene, triangle, origin, direction, t, met.first, met.second)
             t0 = t + wp.max(ray_offset(start + t * d), offset)
     result.status = STEP_LIMIT
     return result
+
+
+@wp.func
+def trace_ray(
+    mesh_id: wp.uint64,
+    scene: SceneView,
+    # Ray:
+    origin: wp.vec3,
+    direction: wp.vec3,
+    normal: wp.vec3,
+    # The mirror it starts on:
+    facet: int,
+    body: OwnBody,
+    # Settings:
+    retry: int,
+    t_first: float,
+) -> RayHit:
+    """`trace_ray_from` of a ray of which nothing is known."""
+    return trace_ray_from(mesh_id, scene, origin, direction, normal, facet, body, retry, t_first, Met())
 
 
 @wp.kernel(module=FREE)
@@ -267,6 +327,7 @@ def trace_pixels_kernel(
     body: OwnBody,
     index: wp.array(dtype=int),
     indexed: int,
+    known: int,
     # Outputs:
     out_triangle: wp.array(dtype=int),
     out_u: wp.array(dtype=float),
@@ -274,11 +335,12 @@ def trace_pixels_kernel(
     out_distance: wp.array(dtype=float),
     out_status: wp.array(dtype=wp.uint8),
 ):
-    """One thread per asked mirror pixel."""
+    """One thread per asked mirror pixel; known 1: the outputs hold what is met first."""
     i = first + wp.tid()
     if indexed != 0:
         i = index[i]
-    hit = trace_ray(mesh_id, scene, point[i], direction[i], normal[i], facets[pixel[i]], body, 0, 0.0)
+    met = answered(known, out_triangle[i], out_u[i], out_v[i], out_distance[i])
+    hit = trace_ray_from(mesh_id, scene, point[i], direction[i], normal[i], facets[pixel[i]], body, 0, 0.0, met)
     out_triangle[i] = hit.triangle
     out_u[i] = hit.u
     out_v[i] = hit.v
@@ -464,6 +526,7 @@ def trace_bounced_kernel(
     normal: wp.array(dtype=wp.vec3),
     direction: wp.array(dtype=wp.vec3),
     bodies: wp.array(dtype=OwnBody),
+    known: int,
     # Outputs:
     out_triangle: wp.array(dtype=int),
     out_u: wp.array(dtype=float),
@@ -471,10 +534,11 @@ def trace_bounced_kernel(
     out_distance: wp.array(dtype=float),
     out_status: wp.array(dtype=wp.uint8),
 ):
-    """One thread per ray."""
+    """One thread per ray; known 1: the outputs hold what is met first."""
     i = first + wp.tid()
     body = bodies[scene.triangle_patch[facet[i]]]
-    hit = trace_ray(mesh_id, scene, point[i], direction[i], normal[i], facet[i], body, 1, 0.0)
+    met = answered(known, out_triangle[i], out_u[i], out_v[i], out_distance[i])
+    hit = trace_ray_from(mesh_id, scene, point[i], direction[i], normal[i], facet[i], body, 1, 0.0, met)
     out_triangle[i] = hit.triangle
     out_u[i] = hit.u
     out_v[i] = hit.v
@@ -610,6 +674,7 @@ def trace_pixels(
     convex: bool,
     index: wp.array | None = None,
     threads: int = 0,
+    kernels: str = "auto",
 ) -> int:
     """Follow the reflected rays of mirror pixels through the BVH and write their hits into the layer.
 
@@ -622,6 +687,7 @@ def trace_pixels(
         convex: The mirror's own triangles are stepped over.
         index: int32, which of the pixels, each at most once; None: all.
         threads: CPU threads; 0: one per core.
+        kernels: `Settings.kernels`.
 
     Returns:
         The number of pixels asked.
@@ -642,7 +708,9 @@ def trace_pixels(
         int(index is not None),
     ]
     outputs = [layer.triangle, layer.u, layer.v, layer.distance, layer.status]
-    launch.launch(trace_pixels_kernel, count, rays + outputs, scene.device, threads, split_min=TRACE_SPLIT_MIN)
+    known = _first_met(scene.mirror_tracer(part), pixels, layer, index, threads, kernels)
+    inputs = [*rays, known, *outputs]
+    launch.launch(trace_pixels_kernel, count, inputs, scene.device, threads, split_min=TRACE_SPLIT_MIN)
     # The neighbours' answers are read from a copy, so that the order of threads cannot matter.
     before = wp.clone(layer.status)
     launch.launch(retry_pixels_kernel, count, [*rays, before, *outputs], scene.device, threads)
@@ -651,6 +719,24 @@ def trace_pixels(
             scene, layer, scene.mirror_tracer(part), gbuffer.triangle, pixels.pixel, body=rays[7], threads=threads
         )
     return count
+
+
+def _first_met(
+    tracer: Tracer,
+    pixels: MirrorPixels,
+    layer: ReflectionLayer,
+    index: wp.array | None,
+    threads: int,
+    kernels: str,
+) -> int:
+    """Leave what rays meet first in a layer's arrays, where there are packets for it: 1, else 0."""
+    if not vector.chosen(kernels, layer.triangle.device):
+        return 0
+    from warp_reflect import bvh_vector  # not compiled where it is not asked for
+
+    rays = [pixels.point, pixels.normal, pixels.direction]
+    bvh_vector.first_met(tracer.id, rays, index, [layer.triangle, layer.u, layer.v, layer.distance], threads)
+    return 1
 
 
 def trace_transmitted(
@@ -688,7 +774,9 @@ def _past_holes(scene: Scene, layer: ReflectionLayer, tracer: Tracer, facet: wp.
     holes.go_past(scene, layer, tracer, facet, *more, **options)
 
 
-def trace_bounced(scene: Scene, layer: ReflectionLayer, facet: wp.array, bodies: wp.array, threads: int = 0) -> None:
+def trace_bounced(
+    scene: Scene, layer: ReflectionLayer, facet: wp.array, bodies: wp.array, threads: int = 0, kernels: str = "auto"
+) -> None:
     """Follow rays that mirrors of any bodies reflect and write their hits into the layer.
 
     Args:
@@ -697,9 +785,11 @@ def trace_bounced(scene: Scene, layer: ReflectionLayer, facet: wp.array, bodies:
         facet: int32 [n], the triangle that each ray starts on.
         bodies: `OwnBody` of every patch.
         threads: CPU threads; 0: one per core.
+        kernels: `Settings.kernels`.
     """
     pixels = layer.pixels
     inputs = [wp.uint64(scene.tracer.id), scene.view, facet, pixels.point, pixels.normal, pixels.direction, bodies]
+    inputs.append(_first_met(scene.tracer, pixels, layer, None, threads, kernels))
     outputs = [layer.triangle, layer.u, layer.v, layer.distance, layer.status]
     launch.launch(
         trace_bounced_kernel, pixels.count, inputs + outputs, scene.device, threads, split_min=TRACE_SPLIT_MIN

@@ -404,7 +404,7 @@ def _met(
         if reflector in solved and layer is layers.get(reflector):  # not where a finish turned its rays
             forward = mirrored_eyes.answers(scene, shown.gbuffer, plan, reflector)
         ask = (scene, shown.gbuffer, mirrors, layer, radiance, reflected, follow, settings.threads, forward)
-        return bounces.onward(*ask)
+        return bounces.onward(*ask, kernels=settings.kernels)
 
     return met
 

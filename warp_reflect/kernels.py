@@ -30,7 +30,7 @@ ROWS = {
     "explosion_map": (*FORWARD, "techniques.explosion_map"),
     "environment": ("environment_maps",),
     "layered_environment": ("environment_maps", "techniques.layered_environment", "-techniques.local_map"),
-    "raytraced": ("bvh",),
+    "raytraced": ("bvh", "|bvh_vector"),
     "refinement": ("|techniques.refine_vector", "-techniques.refine"),
     "grid": ("techniques.interpolation",),
     "second_bounce": ("bounces", "bvh/bounced"),
@@ -60,9 +60,9 @@ def of_preview(settings: Settings, device: wp.DeviceLike, casting: bool = False,
     """
     asked = ["|vector", "raster", "|raster_vector", "-raster/plain"]
     if casting:
-        asked += ["direct", "shadows/tried"]
+        asked += ["direct", "|shadows_vector", "-shadows/tried"]
     if mirrors:
-        asked += ["surface", "|surface_vector", "-surface/plain", "bvh"]
+        asked += ["surface", "|surface_vector", "-surface/plain", "bvh", "|bvh_vector"]
     return _of(asked, vectors(settings, device))
 
 

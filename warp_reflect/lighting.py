@@ -91,7 +91,7 @@ class _Tried:
 
 
 def _tried(scene: Scene, probe: Probe, settings: Settings) -> list[_Tried]:
-    normal, unshadowed, arrived = light_shares(scene, probe.points, PROBE_SAMPLES, settings.threads)
+    normal, unshadowed, arrived = light_shares(scene, probe.points, PROBE_SAMPLES, settings.threads, settings.kernels)
     there = probe.points.triangle.numpy() >= 0
     brought = (unshadowed.astype(np.float64) @ REC709_LUMINANCE)[there]
     arrived = arrived[there].astype(np.float64)

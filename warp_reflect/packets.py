@@ -169,8 +169,9 @@ TRAVERSAL = r"""
             best.face = ipick(hit, I(face), best.face);
             return hit;
         };
-        // No deeper than Warp's own stack: its builders end a branch there.
-        struct Waiting { I mask[GROUPS]; F enter[GROUPS]; int node; } waiting[BVH_QUERY_STACK_SIZE];
+        // Warp's builders end a branch one short of its stack; a tree of groups has such trees under another.
+        constexpr int DEEPEST = 2 * BVH_QUERY_STACK_SIZE;
+        struct Waiting { I mask[GROUPS]; F enter[GROUPS]; int node; } waiting[DEEPEST];
         int waiting_count = 0;
         int node = *tree_mesh.bvh.root;
         while (true) {
@@ -205,6 +206,7 @@ TRAVERSAL = r"""
                 }
                 const bool ask_first = bits(any_first) != 0, ask_second = bits(any_second) != 0;
                 if (ask_first && ask_second) {
+                    if (waiting_count == DEEPEST) return;
                     int balance = 0;
                     EACH_GROUP {
                         const I both = to_first[g] & to_second[g];

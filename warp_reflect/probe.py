@@ -105,7 +105,7 @@ def probe(scene: Scene, small: Preview, parts: list[int], threads: int = 0, kern
         if not len(some):
             continue
         layer = ReflectionLayer.empty(own.select(some, number, width), Technique.RAYTRACED, scene.device)
-        bvh.trace_pixels(scene, gbuffer, layer.pixels, layer, part, False, threads=threads)
+        bvh.trace_pixels(scene, gbuffer, layer.pixels, layer, part, False, threads=threads, kernels=kernels)
         shown = layer.triangle.numpy()
         seen, times = np.unique(mirror_of_patch[scene.host_triangle_patch[shown[shown >= 0]]], return_counts=True)
         mirrored[part] = {int(k): float(n) / len(shown) for k, n in zip(seen, times, strict=True) if k >= 0}

@@ -119,9 +119,9 @@ def _traced(frame: Frame, row, layer: ReflectionLayer, index: np.ndarray) -> Ref
     truth = ReflectionLayer.empty(layer.pixels, Technique.RAYTRACED, scene.device)
     chosen = wp.array(index, dtype=int, device=scene.device)
     convex = reflector.convex
-    bvh.trace_pixels(
-        scene, frame.gbuffer, layer.pixels, truth, reflector.part, convex, chosen, frame.plan.settings.threads
-    )
+    settings = frame.plan.settings
+    how = {"threads": settings.threads, "kernels": settings.kernels}
+    bvh.trace_pixels(scene, frame.gbuffer, layer.pixels, truth, reflector.part, convex, chosen, **how)
     return truth
 
 

@@ -21,7 +21,15 @@ import warp as wp
 
 from warp_reflect import launch, vector
 from warp_reflect.bvh import FINITE_FLAGS, TRACE_SPLIT_MIN, flush_direction, ray_offset, scene_facet_normal
-from warp_reflect.direct import CYLINDER, SPHERE, AreaView, DirectView, Points, area_irradiance, shown_area
+from warp_reflect.direct import (
+    CYLINDER,
+    SPHERE,
+    AreaView,
+    DirectView,
+    Points,
+    area_irradiance,
+    shown_area,
+)
 from warp_reflect.optics import tangent_basis
 from warp_reflect.scene import SHAPE_QUADRIC, Scene, SceneView
 from warp_reflect.settings import Settings
@@ -612,6 +620,13 @@ def light_shares(
 ) -> tuple[np.ndarray, ...]:
     """What each light would bring to points, and which share of it arrives; without normal maps, cut-outs uncut.
 
+    Args:
+        scene: With a triangle and a light that casts shadows at least.
+        points: What is seen.
+        samples: Rays to a shape.
+        threads: CPU threads; 0: one per core.
+        kernels: `Settings.kernels`.
+
     Returns:
         (unit normals on the viewer's side float32 [n, 3]; unshadowed irradiance float32 [n, lights, 3], distant lights
         first, then shapes; shares float32 [n, lights]).
@@ -622,13 +637,25 @@ def light_shares(
     normal = wp.zeros(count, dtype=wp.vec3, device=device)
     unshadowed = wp.zeros(count * lights, dtype=wp.vec3, device=device)
     share = wp.zeros(count * lights, dtype=float, device=device)
-    inputs = [
-        wp.uint64(scene.shadow_tracer.id),
-        scene.view,
-        scene.lights.direct,
-        *_arrays(points, None, device),
-        samples,
-    ]
+    mesh, direct, at = wp.uint64(scene.shadow_tracer.id), scene.lights.direct, _arrays(points, None, device)
+    if vector.chosen(kernels, device):
+        from warp_reflect import shadows_vector
+
+        areas = direct.areas.numpy()
+        starts = shadows_vector.starts_of(
+            [scene.view, direct, *at, points.pixel, 0], count, len(areas), device, threads
+        )
+        shadows_vector.shares(mesh, direct, starts, count, samples, share, threads)
+        n = starts.rows.numpy()[3:6, :count]
+        brought = []
+        for light in direct.distant.numpy():
+            to = light["to_light"]
+            cosine = np.maximum(n[0] * to[0] + n[1] * to[1] + n[2] * to[2], np.float32(0.0))
+            brought.append(cosine[:, None] * light["irradiance"])
+        for light, irradiance in zip(areas, starts.unshadowed.numpy(), strict=True):
+            brought.append(irradiance[:count, None] * light["radiance"])
+        return np.ascontiguousarray(n.T), np.stack(brought, 1), share.numpy().reshape(count, lights)
+    inputs = [mesh, scene.view, direct, *at, samples]
     launch.launch(
         light_shares_kernel, count, [*inputs, normal, unshadowed, share], device, threads, split_min=TRACE_SPLIT_MIN
     )

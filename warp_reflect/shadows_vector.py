@@ -20,8 +20,8 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FINITE_FL
 ROWS = 11  # of `Starts.rows`: point, normal, facet's normal, shift of the samples
 BLOCK_SPLIT_MIN = 8  # blocks; what `bvh.TRACE_SPLIT_MIN` rays are
 # What `send_blocks_kernel` does.
-FIRST, ALL, SKY = 0, 1, 2
-CODES = [FIRST, SKY, SPHERE, CYLINDER, DARK, LIT, NEIGHBOURS]
+FIRST, ALL, EACH, SKY = 0, 1, 2, 3
+CODES = [FIRST, EACH, SKY, SPHERE, CYLINDER, DARK, LIT, NEIGHBOURS]
 
 
 @wp.struct
@@ -160,7 +160,7 @@ def starts_kernel(
     // A light: a distant one, else a shape, or the sky.
     constexpr int SKY = -1;
     const int area_count = lights.areas.shape[0], distant_count = lights.distant.shape[0];
-    const bool to_sky = mode == sky_mode, only_first = mode == first_mode;
+    const bool to_sky = mode == sky_mode, only_first = mode == first_mode, each = mode == each_mode;
     float sum_x[BLOCK], sum_y[BLOCK], sum_z[BLOCK], share[BLOCK], brought[BLOCK], arrived[BLOCK], before[BLOCK];
     int asking[BLOCK];
     for (int j = 0; j < BLOCK; ++j) sum_x[j] = sum_y[j] = sum_z[j] = 0.0f;
@@ -201,7 +201,7 @@ def starts_kernel(
             } else {
                 before[j] = starts.unshadowed.data[k * stride + begin + j];
                 asks = before[j] > 0.0f && cast_areas.data[k] != 0;
-                if (asks && !only_first) {
+                if (asks && !only_first && !each) {
                     const int together = around(begin + j, k);
                     asks = together == (lit | dark);
                     if (together == dark) share[j] = 0.0f;
@@ -281,7 +281,12 @@ def starts_kernel(
                 out_found.data[(begin + j) * area_count + k] = (unsigned char)found;
             }
         }
-        if (to_sky || only_first) continue;
+        for (int j = 0; each && j < end - begin; ++j) {
+            const float* n = rows + 3 * stride + begin + j;
+            if (n[0] == 0.0f && n[stride] == 0.0f && n[2 * stride] == 0.0f) continue;
+            out_share.data[(begin + j) * (distant_count + area_count) + light] = share[j];
+        }
+        if (to_sky || only_first || each) continue;
         const auto& color = distant ? lights.distant.data[light].irradiance : lights.areas.data[k].radiance;
         for (int j = 0; j < end - begin; ++j) {
             if (!(before[j] > 0.0f)) continue;
@@ -291,7 +296,7 @@ def starts_kernel(
             sum_z[j] += arrives * color[2];
         }
     }
-    if (to_sky || only_first) return;
+    if (to_sky || only_first || each) return;
     for (int j = 0; j < end - begin; ++j) {
         float* to = (float*)(out_irradiance.data + begin + j);
         to[0] = sum_x[j]; to[1] = sum_y[j]; to[2] = sum_z[j];
@@ -313,6 +318,7 @@ def send_block(
     index: wp.array(dtype=int),
     mode: int,
     first_mode: int,
+    each_mode: int,
     sky_mode: int,
     sphere: int,
     cylinder: int,
@@ -340,6 +346,7 @@ def send_blocks_kernel(
     index: wp.array(dtype=int),
     mode: int,
     first_mode: int,
+    each_mode: int,
     sky_mode: int,
     sphere: int,
     cylinder: int,
@@ -351,7 +358,7 @@ def send_blocks_kernel(
     out_irradiance: wp.array(dtype=wp.vec3),
     out_share: wp.array(dtype=float),
 ):
-    """One thread per block of points. Mode: the first rays to each shape, all rays that are worth it, or the domes'."""
+    """One thread per block of points; mode: `FIRST` rays, `ALL` that are worth it, `EACH` light apart, or to the `SKY`."""
     send_block(
         first + wp.tid(),
         mesh_id,
@@ -366,6 +373,7 @@ def send_blocks_kernel(
         index,
         mode,
         first_mode,
+        each_mode,
         sky_mode,
         sphere,
         cylinder,
@@ -419,6 +427,17 @@ def irradiance(
     for mode in (FIRST, ALL) if asked else (ALL,):
         inputs = [mesh, lights, *cast, starts, count, samples[mode == ALL], *image, mode, *CODES]
         _launch(count, [*inputs, found, out_irradiance, none], device, threads)
+
+
+def shares(
+    mesh: wp.uint64, lights: DirectView, starts: Starts, count: int, samples: int, out_share: wp.array, threads: int = 0
+) -> None:
+    """The last output of `shadows.light_shares_kernel`."""
+    device = out_share.device
+    none, no_points = wp.zeros(0, dtype=int, device=device), wp.zeros(0, dtype=wp.vec3, device=device)
+    cast = [wp.full(len(kind), 1, dtype=int, device=device) for kind in (lights.distant, lights.areas)]
+    inputs = [mesh, lights, *cast, starts, count, samples, none, 0, none, EACH, *CODES]
+    _launch(count, [*inputs, wp.zeros(0, dtype=wp.uint8, device=device), no_points, out_share], device, threads)
 
 
 def sky_share(mesh: wp.uint64, starts: Starts, count: int, samples: int, out_share: wp.array, threads: int = 0) -> None:

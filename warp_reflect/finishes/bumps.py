@@ -141,5 +141,6 @@ def _traced(scene: Scene, shown: shade.Shown, layer: ReflectionLayer, turned: Mi
     """What rays see that start on a mirror's pixels."""
     answer = ReflectionLayer.empty(turned, layer.method, scene.device)
     part, convex = row.reflector.part, row.reflector.convex
-    bvh.trace_pixels(scene, shown.gbuffer, turned, answer, part, convex, threads=row.settings.threads)
+    how = {"threads": row.settings.threads, "kernels": row.settings.kernels}
+    bvh.trace_pixels(scene, shown.gbuffer, turned, answer, part, convex, **how)
     return shown.seen(answer)

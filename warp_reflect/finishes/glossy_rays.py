@@ -150,7 +150,8 @@ def followed(scene, shown, layer, row, which: int, count: int) -> Iterator[Rays]
         outputs = [normal, direction, weight, density]
         launch.launch(jitter_kernel, n, [*surface, width, k, count, which, *outputs], device, threads)
         answer = ReflectionLayer.empty(turned, layer.method, device)
-        bvh.trace_pixels(scene, shown.gbuffer, turned, answer, reflector.part, reflector.convex, threads=threads)
+        how = {"threads": threads, "kernels": row.settings.kernels}
+        bvh.trace_pixels(scene, shown.gbuffer, turned, answer, reflector.part, reflector.convex, **how)
         yield Rays(weight, density, answer, shown.seen(answer))
 
 

@@ -232,7 +232,8 @@ def traced(scene: Scene, shown: shade.Shown, layer: ReflectionLayer, row) -> wp.
     turned = MirrorPixels(pixels.reflector, pixels.pixel, pixels.point, pixels.normal, direction, pixels.box)
     answer = ReflectionLayer.empty(turned, layer.method, scene.device)
     # A flat mirror never sees itself.
-    bvh.trace_pixels(scene, shown.gbuffer, turned, answer, row.reflector.part, True, threads=settings.threads)
+    how = {"threads": settings.threads, "kernels": settings.kernels}
+    bvh.trace_pixels(scene, shown.gbuffer, turned, answer, row.reflector.part, True, **how)
     return shown.seen(answer)
 
 

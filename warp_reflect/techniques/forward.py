@@ -280,7 +280,15 @@ def reflect(
         doubtful = refine.in_doubt_of_holes(scene, layer)
         if doubtful is not None:
             bvh.trace_pixels(
-                scene, gbuffer, pixels, layer, reflector.part, reflector.convex, doubtful, settings.threads
+                scene,
+                gbuffer,
+                pixels,
+                layer,
+                reflector.part,
+                reflector.convex,
+                doubtful,
+                settings.threads,
+                settings.kernels,
             )
     else:
         with timer("own_body"):
@@ -304,7 +312,15 @@ def reflect(
             )
         with timer("trace"):
             bvh.trace_pixels(
-                scene, gbuffer, pixels, layer, reflector.part, reflector.convex, doubtful, settings.threads
+                scene,
+                gbuffer,
+                pixels,
+                layer,
+                reflector.part,
+                reflector.convex,
+                doubtful,
+                settings.threads,
+                settings.kernels,
             )
     layer.statistics.update(vertices=mesh.vertex_count, drawn=drawn, clipped=clipped, failed=failed)
     layer.timings = timer.ms

@@ -91,7 +91,15 @@ def reflect(
         wp.copy(getattr(layer, name), wp.array(whole[name], dtype=getattr(layer, name).dtype, device=scene.device))
     left = wp.array(np.flatnonzero(numbers == 0).astype(np.int32), dtype=int, device=scene.device)
     traced = bvh.trace_pixels(
-        scene, gbuffer, pixels, layer, reflector.part, reflector.convex, left, threads=settings.threads
+        scene,
+        gbuffer,
+        pixels,
+        layer,
+        reflector.part,
+        reflector.convex,
+        left,
+        threads=settings.threads,
+        kernels=settings.kernels,
     )
     layer.statistics["bvh"] = layer.statistics.get("bvh", 0) + traced
     return layer

@@ -488,7 +488,8 @@ def reflect_branches(
             scene, gbuffer, pixels, target, together, layer, blocked, settings, trust_sky=False, seen=seen
         )
     with timer("trace"):
-        bvh.trace_pixels(scene, gbuffer, pixels, layer, reflector.part, reflector.convex, left, settings.threads)
+        how = {"threads": settings.threads, "kernels": settings.kernels}
+        bvh.trace_pixels(scene, gbuffer, pixels, layer, reflector.part, reflector.convex, left, **how)
     layer.statistics.update(doubt=int(doubtful.sum()))
     layer.timings = timer.ms
     return layer

@@ -178,7 +178,14 @@ def reflect(
         # Only rounding at the silhouette shows the outside from in there.
         layer = ReflectionLayer.empty(pixels, Technique.QUADRIC, scene.device)
         traced = bvh.trace_pixels(
-            scene, gbuffer, pixels, layer, reflector.part, reflector.convex, threads=settings.threads
+            scene,
+            gbuffer,
+            pixels,
+            layer,
+            reflector.part,
+            reflector.convex,
+            threads=settings.threads,
+            kernels=settings.kernels,
         )
         layer.statistics["bvh"] = traced
         return layer

@@ -45,6 +45,13 @@ def reflect(
     """
     layer = ReflectionLayer.empty(pixels, Technique.RAYTRACED, scene.device)
     layer.statistics["bvh"] = bvh.trace_pixels(
-        scene, gbuffer, pixels, layer, prepared.part, prepared.convex, threads=settings.threads
+        scene,
+        gbuffer,
+        pixels,
+        layer,
+        prepared.part,
+        prepared.convex,
+        threads=settings.threads,
+        kernels=settings.kernels,
     )
     return layer
