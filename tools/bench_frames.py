@@ -1,12 +1,15 @@
 """Time and error of whole frames and of the reflection pass, side by side, one process, contenders in turn.
 
     python tools/bench_frames.py usd_scenes/kitchen.usda usd_scenes/one_mirror.usda --size 1280x720 --frames 9
+    python tools/bench_frames.py usd_scenes/one_mirror.usda --size 640x480 1280x720 1920x1080 --cpu
     python tools/bench_frames.py usd_scenes/kitchen.usda --path 60
     python tools/bench_frames.py usd_scenes/kitchen.usda --slopes --threads 2
 
 Per stage, on the same pixels with the same number of threads: the planned technique (cold: no history; warm: from the
 previous frame), the project's own BVH reference (its best flags), and Embree through embreex where it is installed
-(single rays in one call, one thread). Error and time stand on the same row. `--json` prints one JSON line per row.
+(single rays in one call, one thread): the mirror's rays alone, and a wavefront of eye and mirror rays for the frame, without
+shading. Error and time stand on the same row. `--json` prints one JSON line per row; `--cpu` counts this thread's own time,
+which others on the machine disturb less.
 
 `--path N`: frame times while the camera walks N frames on a circle about the mirrors, each frame from the one before: the
 first frame, percentiles, the worst, a histogram. `--slopes`: how the reflections' time grows with pixels, vertices
@@ -27,10 +30,13 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 
+sys.path.insert(0, str(Path(__file__).parent))
+
 from warp_reflect import sweep
 from warp_reflect.devices import open_device
 from warp_reflect.launch import thread_count
 from warp_reflect.sweep import Embree, commit
+from warp_reflect.timing import counted_by
 
 PIXEL_SCALES = (0.25, 0.5, 1.0)  # of the picture's sides
 MESH_SCALES = (0.5, 1.0, 2.0)  # of the segments along each direction of every mesh
@@ -41,7 +47,7 @@ BAR = 40  # characters of its longest bar
 def parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("stages", nargs="+")
-    parser.add_argument("--size", default="1280x720", help="WxH")
+    parser.add_argument("--size", nargs="+", default=["1280x720"], help="WxH, one or several")
     parser.add_argument("--frames", type=int, default=9, help="timed frames per contender, after two for warm-up")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--device", default="cpu")
@@ -51,6 +57,9 @@ def parse() -> argparse.Namespace:
         "--slopes", action="store_true", help="how time grows with pixels, vertices, reflectors, threads"
     )
     parser.add_argument("--method", default="auto", help="the technique of --path and --slopes, beside the reference")
+    parser.add_argument(
+        "--cpu", action="store_true", help="this thread's processor time instead of the wall's (one thread)"
+    )
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--preview", help="folder for pictures of the frames that were timed")
     return parser.parse_args()
@@ -59,15 +68,19 @@ def parse() -> argparse.Namespace:
 def main() -> None:
     arguments = parse()
     open_device(arguments.device)  # quietly
-    width, height = (int(side) for side in arguments.size.split("x"))
+    sizes = [tuple(int(side) for side in size.split("x")) for size in arguments.size]
+    if arguments.cpu and (arguments.threads != 1 or arguments.device != "cpu"):
+        sys.exit("--cpu counts one thread: use --threads 1 --device cpu")
     rows = []
     measure, show = (bench, table)
     if arguments.path:
         measure, show = walk, path_table
     elif arguments.slopes:
         measure, show = slopes, slope_table
-    for stage in arguments.stages:
-        rows += measure(stage, (width, height), arguments)
+    with counted_by(time.thread_time if arguments.cpu else time.perf_counter):
+        for stage in arguments.stages:
+            for size in sizes:
+                rows += measure(stage, size, arguments)
     if arguments.json:
         for row in rows:
             print(json.dumps(row))
@@ -122,17 +135,21 @@ def bench(stage: str, size: tuple[int, int], arguments) -> list[dict]:
     first = wr.render_frame(scene, contenders["auto"][0])
     first_picture = time.perf_counter() - start
     embree = Embree.over(scene, first)
-    embree_ms = []
+    wave = wavefront(scene, first) if embree else None
+    clock = time.thread_time if arguments.cpu else time.perf_counter
+    embree_ms, wave_ms = [], []
     for round_ in range(arguments.frames + 2):
         for name, (plan, warm) in contenders.items():
             frame = wr.render_frame(scene, plan, previous=frames.get(name) if warm else None)
             frames[name] = frame
             if round_ >= 2:
                 times[name].append(frame.timings)
-        if embree:
-            elapsed = embree.trace()
-            if round_ >= 2:
-                embree_ms.append(elapsed)
+        for contender, taken in ((embree, embree_ms), (wave, wave_ms)):
+            if contender is not None:
+                started = clock()
+                contender.trace()
+                if round_ >= 2:
+                    taken.append(1000.0 * (clock() - started))
     told = common(stage, size, scene, arguments) | {"load_s": loaded, "first_picture_s": first_picture}
     rows = []
     for name, (plan, _) in contenders.items():
@@ -168,7 +185,7 @@ def bench(stage: str, size: tuple[int, int], arguments) -> list[dict]:
                 "technique": "Embree, same rays, hits only",
                 "reflect_ms": statistics.median(embree_ms),
                 "reflect_p95_ms": float(np.percentile(embree_ms, 95)),
-                "frame_ms": None,
+                "frame_ms": statistics.median(wave_ms) if wave_ms else None,
                 "steps_ms": {},
                 "identical": embree.agreement(frames["reference"]),
                 "wrong": None,
@@ -177,6 +194,13 @@ def bench(stage: str, size: tuple[int, int], arguments) -> list[dict]:
             }
         )
     return rows
+
+
+def wavefront(scene, frame):
+    """Embree's eye and mirror rays by `peers.Wavefront`; None where nothing is reflected."""
+    from peers import Wavefront  # which imports this module
+
+    return Wavefront(scene, frame) if frame.layers else None
 
 
 def walk(stage: str, size: tuple[int, int], arguments) -> list[dict]:
@@ -340,21 +364,21 @@ def slope_table(rows: list[dict]) -> None:
 def table(rows: list[dict]) -> None:
     """Print the rows for a reader."""
     first = rows[0]
-    print(
-        f"{first['machine']}; warp {first['warp']}; {first['threads']} thread(s); {first['size'][0]}x{first['size'][1]}"
-    )
-    header = f"{'stage':14s} {'contender':10s} {'reflect ms':>10s} {'p95':>7s} {'x ref':>6s} "
+    print(f"{first['machine']}; warp {first['warp']}; {first['threads']} thread(s)")
+    header = f"{'stage':14s} {'size':10s} {'contender':10s} {'reflect ms':>10s} {'p95':>7s} {'x ref':>6s} "
     header += f"{'frame ms':>9s} {'identical':>10s}"
     print(header + "  steps (ms)")
     for row in rows:
-        reference = next(r for r in rows if r["stage"] == row["stage"] and r["contender"] == "reference")
+        same = (r for r in rows if (r["stage"], r["size"]) == (row["stage"], row["size"]))
+        reference = next(r for r in same if r["contender"] == "reference")
         ratio = reference["reflect_ms"] / max(row["reflect_ms"], 1e-9)
         frame = f"{row['frame_ms']:9.1f}" if row["frame_ms"] is not None else " " * 9
         steps = ", ".join(
             f"{step.split('/')[-1]} {ms:.1f}" for step, ms in row["steps_ms"].items() if step != "reflect"
         )
+        size = "x".join(map(str, row["size"]))
         print(
-            f"{row['stage']:14s} {row['contender']:10s} {row['reflect_ms']:10.1f} {row['reflect_p95_ms']:7.1f} "
+            f"{row['stage']:14s} {size:10s} {row['contender']:10s} {row['reflect_ms']:10.1f} {row['reflect_p95_ms']:7.1f} "
             f"{ratio:6.2f} {frame} {100 * row['identical']:9.4f}%  {steps}"
         )
 

@@ -10,6 +10,7 @@ where it is installed, Embree's eye and mirror rays through embreex without shad
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
 import statistics
 import sys
@@ -20,13 +21,14 @@ from pathlib import Path
 import warp as wp
 
 sys.path.insert(0, str(Path(__file__).parent))
-from bench_frames import commit, machine
+from bench_frames import commit, machine, wavefront
 
 # Loop: kernels of either kind. The plain search runs after the vector one, for what that leaves.
 LOOPS = {
     "rasterise, eye and virtual": ("draw_kernel", "draw_lanes_kernel"),
     "meet the mirror": ("mirror_pixels_kernel", "mirror_blocks_kernel"),
     "search reflection points": ("search_kernel", "search_blocks_kernel"),
+    "step from a grid's directions": ("direction_kernel", "direction_lanes_kernel"),
     "refine": ("settle_kernel", "coarse_kernel", "settle_blocks_kernel", "coarse_blocks_kernel"),
     "shade": (
         "shade_kernel",
@@ -82,7 +84,7 @@ def bench(arguments: argparse.Namespace) -> list[dict]:
         for kernels in ("plain", "vector")
     }
     frames = {kernels: wr.render_frame(scene, plan) for kernels, plan in plans.items()}
-    wave = wavefront(scene, frames["vector"])
+    wave = wavefront(scene, frames["vector"]) if importlib.util.find_spec("embreex") else None
     times: dict[str, list[Counter]] = {kernels: [] for kernels in plans}
     whole: dict[str, list[float]] = {kernels: [] for kernels in (*plans, "wavefront")}
     for round_ in range(arguments.rounds + 1):
@@ -116,17 +118,6 @@ def bench(arguments: argparse.Namespace) -> list[dict]:
     if wave is not None:
         rows.append(row_of("embree wavefront, no shading", None, statistics.median(whole["wavefront"]), 0))
     return rows
-
-
-def wavefront(scene, frame):
-    """The contender of `peers.py`; None where embreex is missing or nothing is reflected."""
-    try:
-        import embreex  # noqa: F401
-    except ImportError:
-        return None
-    from peers import Wavefront
-
-    return Wavefront(scene, frame) if frame.layers else None
 
 
 def row_of(loop: str, plain: float | None, vector: float, elements: int) -> dict:
