@@ -95,6 +95,7 @@ class InstanceData:
     materials: tuple[int, ...]  # one per part, index into SceneData.materials
     instance: str = ""  # which copy, where several share prim_path (point instancers)
     moves: bool = False  # something of it may be otherwise at another time
+    mover: str = ""  # the innermost prim, it or one above it, by which it moves
 
 
 @dataclass(frozen=True)

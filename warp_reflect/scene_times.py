@@ -105,7 +105,8 @@ def _same_but_bent(a: MeshData, b: MeshData) -> bool:
 
 
 def _identity(instance: InstanceData) -> tuple:
-    return instance.mesh, instance.prim_path, instance.instance, instance.materials, instance.moves
+    place = instance.prim_path, instance.instance
+    return instance.mesh, *place, instance.materials, instance.moves, instance.mover
 
 
 def lay_out(scene: Scene, earlier: Scene, moved: list[int]) -> None:

@@ -45,7 +45,7 @@ class State:
     visible: bool = True
     purpose: str = "default"
     inside_instancer: bool = False
-    moves: bool = False
+    mover: str = ""  # the innermost of them that may move in time
 
 
 @dataclass
@@ -139,9 +139,10 @@ class Walk:
             world, resets = world_of(prim, state.world_from_parent, self.transforms)
             if resets and state.inside_instancer:
                 self.intake.note(prim.GetPath(), "xformOpOrder: !resetXformStack! stops at the point instancer")
-            moves = state.moves or imageable.GetVisibilityAttr().ValueMightBeTimeVarying()
+            moves = imageable.GetVisibilityAttr().ValueMightBeTimeVarying()
             moves = moves or (prim.IsA(UsdGeom.Xformable) and UsdGeom.Xformable(prim).TransformMightBeTimeVarying())
-            state = State(world, visible, purpose, state.inside_instancer, moves)
+            mover = str(prim.GetPath()) if moves else state.mover
+            state = State(world, visible, purpose, state.inside_instancer, mover)
         kind = prim.GetTypeName()
         schemas = applied(prim)
         if MIRROR_API in schemas:
@@ -205,8 +206,9 @@ class Walk:
         if path not in self._drawn_index:
             self._drawn_index[path] = len(self.drawn)
             self.drawn.append(prim)
-        moves = state.moves or _varies(prim)
-        found.append(InstanceData(self._drawn_index[path], state.world_from_parent, path, (), moves=moves))
+        mover = path if _varies(prim) else state.mover
+        index = self._drawn_index[path]
+        found.append(InstanceData(index, state.world_from_parent, path, (), moves=mover != "", mover=mover))
 
     def _instancer(self, prim, state: State, found: list[InstanceData]) -> None:
         path = str(prim.GetPath())
@@ -215,14 +217,14 @@ class Walk:
         except BadPrim as fault:
             self.intake.bad(path, f"{fault}; instancer dropped")
             return
-        moves = state.moves or _varies(prim)
+        mover = path if _varies(prim) else state.mover
         for k, target in enumerate(targets):
             chosen = np.flatnonzero(prototype == k)
             if not len(chosen):
                 continue
             items = self._prototype(prim, target, state.purpose)
-            if moves:
-                items = [replace(item, moves=True) for item in items]
+            if mover:
+                items = [replace(item, moves=True, mover=item.mover or mover) for item in items]
             if len(items) * len(chosen) + len(found) > self.intake.limits.instances:
                 raise ValueError(f"<{path}>: more than {self.intake.limits.instances} instances; raise the limit")
             worlds = state.world_from_parent @ transforms[chosen]

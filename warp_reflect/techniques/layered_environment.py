@@ -27,7 +27,7 @@ from warp_reflect.shapes import TriangleHit, clamp_weights, intersect_triangle, 
 from warp_reflect.techniques import local_map, local_mesh, local_movers, reference_maps
 from warp_reflect.techniques.environment import Shown, centre_of, onward_of
 from warp_reflect.techniques.local_mesh import DepthMesh
-from warp_reflect.techniques.local_movers import moving_in
+from warp_reflect.techniques.local_movers import moving_in, vehicle_of
 from warp_reflect.techniques.reference_maps import ReferenceMaps
 
 wp.set_module_options({"enable_backward": False})
@@ -39,6 +39,7 @@ MAX_ITERATIONS = wp.constant(int(Status.MAX_ITERATIONS))
 MISSING = wp.constant(local_map.TEXEL_MISSING)
 KEY, FIELD_KEY = "local maps", "field of local maps"
 PLANE_STEPS = wp.constant(3)  # from texel to texel; walls settle in one or two
+NAMED = 4  # prims that a note names
 CANDIDATES_PER_MAP = 2  # maps that are looked at for each that is blended, where more than two are
 
 
@@ -85,6 +86,11 @@ def plan_notes(scene: Scene, reflector, settings: Settings) -> list[Note]:
         notes.append(
             Note("/", "none of its environment maps can be used: maps are placed along the paths of its mirrors")
         )
+    vehicle = list(dict.fromkeys(scene.parts[k].prim_path for k in vehicle_of(scene, reflector.part, settings)))
+    if vehicle:
+        named = ", ".join(vehicle[:NAMED]) + (f" and {len(vehicle) - NAMED} more" if len(vehicle) > NAMED else "")
+        text = f"its own vehicle is not in its local map: {named} (local_own_size={settings.local_own_size:g})"
+        notes.append(Note(part.prim_path, text))
     megabytes = reference_maps.predicted_bytes(scene, settings) / 1e6
     most = "" if usable else "at most "
     count = len(usable) or settings.rem_limit
@@ -101,7 +107,7 @@ def prepare(scene: Scene, reflector, settings: Settings) -> Prepared:
     """Build the mirror's local map; the scene's reference maps are drawn at first use."""
     part = reflector.part
     made = _still_map(scene, part, settings)
-    movers = moving_in(scene, part)
+    movers = moving_in(scene, part, settings)
     beyond = _beyond(scene, part, made.references.placement.centres, made.references.reach)
     scene.notes += [note for note in beyond if note not in scene.notes]
     if not movers or settings.environment_update == "previous":

@@ -58,14 +58,43 @@ class Movers:
         self.without = parts
 
 
-def moving_in(scene: Scene, part: int) -> tuple[int, ...]:
-    """The parts that move and that a mirror may show: not itself, nor what its collection does not name."""
-    seen = scene.seen_in(scene.parts[part])
+def moving_in(scene: Scene, part: int, settings: Settings) -> tuple[int, ...]:
+    """The parts that move and that a mirror may show: not itself, nor its vehicle, nor what its collection does not name."""
+    seen, own = scene.seen_in(scene.parts[part]), {part, *vehicle_of(scene, part, settings)}
     return tuple(
         k
         for k in scene.moving_parts
-        if k != part and scene.parts[k].triangle_count and (seen is None or seen[scene.parts[k].first_triangle])
+        if k not in own and scene.parts[k].triangle_count and (seen is None or seen[scene.parts[k].first_triangle])
     )
+
+
+def vehicle_of(scene: Scene, part: int, settings: Settings) -> tuple[int, ...]:
+    """What moves with a mirror and is about as large: a map's eye is amid it, where it would hide what the mirror shows.
+
+    Meyer and Loscos leave a car out of its own map. A small mirror on a large vehicle, whose eye is not within it, shows it;
+    what stands still is no vehicle, since it is not known what would move together.
+
+    Args:
+        scene: Its instances name what they move by.
+        part: The mirror, index into `scene.parts`.
+        settings: `local_own_size`.
+
+    Returns:
+        The parts, without the mirror; none where it does not move.
+    """
+    instances, own = scene.data.instances, scene.parts[part]
+    by, copy = instances[own.prim - 1].mover, own.instance
+    if not by or settings.local_own_size == 0.0:
+        return ()
+    with_it = [
+        k
+        for k in scene.moving_parts
+        if scene.parts[k].instance == copy and f"{instances[scene.parts[k].prim - 1].mover}/".startswith(f"{by}/")
+    ]
+    first, _, boxes = scene.boxes
+    rows = np.searchsorted(first, [own.first_vertex, *(scene.parts[k].first_vertex for k in with_it)])
+    alone, together = (np.linalg.norm(np.ptp(boxes[each].reshape(-1, 3), axis=0)) for each in (rows[:1], rows))
+    return tuple(k for k in with_it if k != part) if together <= settings.local_own_size * alone else ()
 
 
 @wp.kernel
