@@ -10,7 +10,8 @@ a variable), per architecture. Both stand in the section `.nv.info` of the binar
 from __future__ import annotations
 
 import argparse
-import importlib
+import itertools
+import json
 import re
 import struct
 import tempfile
@@ -18,6 +19,8 @@ from collections import defaultdict
 from pathlib import Path
 
 import warp as wp
+
+from warp_reflect import kernels
 
 ARCHITECTURES = (75, 80, 86, 89, 90, 100, 120)
 HOT = (
@@ -38,8 +41,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("modules", nargs="*", default=HOT)
     parser.add_argument("--arch", nargs="+", type=int, default=ARCHITECTURES)
+    parser.add_argument("--json", action="store_true", help="one JSON line per kernel")
     arguments = parser.parse_args()
     wp.config.log_level = wp.LOG_WARNING
+    if arguments.json:
+        for module in arguments.modules:
+            for kernel, used in sorted(kernels_of(module, arguments.arch).items()):
+                cells = {f"sm_{arch}": f"{registers}/{stack}" for arch, (registers, stack) in used.items()}
+                print(json.dumps({"module": module, "kernel": kernel, **cells}))
+        return
     print(f"warp {wp.__version__}; registers / stack bytes a thread")
     print(f"{'kernel':42s}" + "".join(f"{f'sm_{arch}':>11s}" for arch in arguments.arch))
     for module in arguments.modules:
@@ -50,11 +60,10 @@ def main() -> None:
 
 def kernels_of(module: str, architectures: list[int]) -> dict[str, dict[int, tuple[int, int]]]:
     """Kernel to architecture to (registers, stack bytes)."""
-    kernels = importlib.import_module(module)
     found: dict[str, dict[int, tuple[int, int]]] = defaultdict(dict)
-    for arch in architectures:
+    for part, arch in itertools.product(kernels.modules_of(module), architectures):
         with tempfile.TemporaryDirectory() as folder:
-            made = wp.compile_aot_module(kernels, arch=[arch], module_dir=folder, use_ptx=False)
+            made = wp.compile_aot_module(part, arch=[arch], module_dir=folder, use_ptx=False)
             for path in made:
                 if Path(path).suffix == ".cubin":
                     for name, used in usage(Path(path).read_bytes()).items():
