@@ -5,12 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import street
+import warp as wp
 from pxr import Gf, UsdGeom
 from stage_samples import add_material, saved
 from test_layered_environment import plan_of
 
 import warp_reflect as wr
-from warp_reflect.techniques import layered_environment, local_movers
+from warp_reflect.cubemap import texel_directions
+from warp_reflect.environment_maps import empty_maps
+from warp_reflect.techniques import layered_environment, local_map, local_movers
 
 
 def car_stage(path, trailer: bool = False):
@@ -99,3 +102,61 @@ def test_vehicles_hold_in_time(tmp_path):
 def test_ratios_that_cannot_be_are_refused(size):
     with pytest.raises(ValueError, match="local_own_size"):
         wr.Settings(local_own_size=size)
+
+
+def empty_map(scene, eye, edge: int, distance):
+    """A local map at a place, scene frame, that holds nothing but distances of what stands still."""
+    local = empty_maps(scene, (eye + scene.origin)[None], np.eye(3)[None], edge)
+    local.view.distance = wp.array(distance, dtype=float, device=scene.device)
+    local.view.triangle.fill_(-1)
+    return local, wp.zeros(len(distance), dtype=wp.uint8, device=scene.device)
+
+
+@pytest.mark.parametrize("edge", [16, 21, 48])
+def test_texels_show_the_moving_triangles_that_their_rays_meet(tmp_path, edge, device):
+    """From beside, within and above what moves, at two times of one tree: what rays through all triangles meet first."""
+    first = wr.load_stage(saved(car_stage(tmp_path / "car.usda")), time=1.0, device=device)
+    local_movers._movers(first)
+    later = first.at(3.0)
+    layered_environment.take_over(first, later)
+    assert local_movers._movers(later).tree is local_movers._movers(first).tree
+    directions = texel_directions(edge).reshape(-1, 3)
+    directions = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).astype(np.float32)
+    settings = wr.Settings(shadows="off", bounces=1, threads=1)
+    for scene in (later, first, later):
+        walker = next(part for part in scene.parts if part.prim_path.endswith("Walker"))
+        own = scene.host_triangles[walker.first_triangle : walker.first_triangle + walker.triangle_count]
+        middle = scene.host_points[own.reshape(-1)].mean(axis=0).astype(np.float64)
+        for away in ([1.1, 0.2, 0.3], [0.01, 0.02, 0.03], [0.0, 3.0, 0.0]):
+            eye = middle + away
+            rays = np.tile(eye, (len(directions), 1)), directions, 1
+            still, far = (tracer.trace(*rays) for tracer in (scene.still_tracer, scene.tracer))
+            distance = np.where(still[0].numpy() >= 0, still[1].numpy(), 0.0).astype(np.float32)
+            moves = np.zeros(scene.triangle_count, bool)
+            for part in (scene.parts[k] for k in scene.moving_parts):
+                moves[part.first_triangle : part.first_triangle + part.triangle_count] = True
+            ask = (*empty_map(scene, eye, edge, distance), scene.moving_parts, lambda seen: None, settings)
+            made, state, statistics = local_movers.draw_moving(scene, *ask)
+            shown = state.numpy() == local_map.TEXEL_SHADED
+            met, t = far[0].numpy(), far[1].numpy()
+            real = (met >= 0) & moves[met]
+            apart = (distance == 0.0) | (np.abs(distance - t) > 1e-5 * distance)  # feet lie in the plane of the ground
+            np.testing.assert_array_equal(shown[apart], real[apart])
+            assert statistics["local_moving"] == shown.sum() >= 5
+            both = shown & real
+            np.testing.assert_allclose(made.distance(0).reshape(-1)[both], t[both], rtol=1e-5)
+            assert (made.triangle(0).reshape(-1) == met)[both].mean() > 0.98
+            np.testing.assert_array_equal(made.distance(0).reshape(-1)[~shown], distance[~shown])
+
+
+def test_parts_that_are_not_asked_for_are_not_met(tmp_path):
+    scene = load(tmp_path / "car.usda")
+    part = ball(scene)
+    eye = layered_environment.centre_of(scene, part) - scene.origin
+    asked = local_movers.moving_in(scene, part, wr.Settings())
+    ask = (*empty_map(scene, eye, 32, np.zeros(6 * 32 * 32, np.float32)), asked, lambda seen: None)
+    made, _, _ = local_movers.draw_moving(scene, *ask, wr.Settings(shadows="off", bounces=1))
+    triangle = made.triangle(0)
+    walker = scene.parts[asked[0]]
+    inside = (triangle >= walker.first_triangle) & (triangle < walker.first_triangle + walker.triangle_count)
+    assert len(asked) == 1 and inside.any() and (inside | (triangle < 0)).all()

@@ -173,6 +173,7 @@ def take_over(earlier: Scene, scene: Scene) -> None:
     reference_maps.take_over(earlier, scene)
     if earlier is scene or not reference_maps.same_numbers(earlier, scene):
         return
+    local_movers.take_over(earlier, scene)
     if any(key[0] == FIELD_KEY for key in earlier.environments):
         from warp_reflect.techniques import local_field
 
