@@ -33,7 +33,7 @@ FLOORS = {
     4: "kernels planner detail mirrored_eyes effects lighting probe budget choice applicable calibration calibrate realised bake "
     "frame motion virtual_objects "
     "seen sweep sweep_report",
-    5: "cli warmup viewer viewer.* pipeline process progress cluster farm",
+    5: "__main__ cli warmup viewer viewer.* pipeline process progress cluster farm",
 }
 # Where an imported library may appear, inside functions or out.
 HOMES = {

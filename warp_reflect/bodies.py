@@ -93,7 +93,8 @@ def analyse(points: np.ndarray, triangles: np.ndarray) -> Body:
     solid = area > 1.0e-12 * max(float(area.max(initial=0.0)), 1.0e-300)
     unit = normal[solid] / area[solid, None]
     height = np.einsum("ij,ij->i", unit, corner[solid][:, 0])
-    turned = bool(len(height)) and np.median(height) < 0.0  # inside-out body
+    middle = np.sort(height)[[(len(height) - 1) // 2, len(height) // 2]] if len(height) else np.zeros(1)
+    turned = bool(middle.sum() < 0.0)  # inside-out body; not `np.median`, which imports masked arrays
     if turned:
         unit, height = -unit, -height
     full = abs(abs(_solid_angle(corner)) / (4.0 * np.pi) - 1.0) < SOLID_ANGLE_TOLERANCE

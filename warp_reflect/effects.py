@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from warp_reflect.layers import Camera
 from warp_reflect.scene import FinishData, MaterialData, PartRange, Scene
 from warp_reflect.settings import Settings
-from warp_reflect.techniques import MAPS, planar, refraction_image
+from warp_reflect.techniques import MAPS, planar
 
 # The effects of mirrors that are finishes, in the order in which they are applied, and the module of `finishes` of each.
 FINISHES: dict[str, str] = {
@@ -162,6 +162,8 @@ def refraction_effect(
         return Effect(False, "refraction=traced")
     if camera.orthographic:
         return Effect(False, "a parallel camera's rays are traced")
+    from warp_reflect.techniques import refraction_image
+
     drawn, reason, numbers = refraction_image.applies(scene, part, pixels)
     if settings.refraction == "drawn" and numbers:
         return Effect(True, "refraction=drawn", numbers)

@@ -6,6 +6,7 @@ import dataclasses
 import importlib
 import os
 from functools import cached_property, partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
@@ -16,12 +17,9 @@ from warp_reflect import (
     images,
     kernels,
     mirrored_eyes,
-    motion,
     raster,
     shade,
     surface,
-    transmission,
-    waves,
 )
 from warp_reflect.channels import CHANNELS, POINTS, component_of, known_names, reflection_channels
 from warp_reflect.choice import Spent
@@ -30,9 +28,11 @@ from warp_reflect.layers import NO_REFLECTOR, Camera, GBuffer, MirrorPixels, Ref
 from warp_reflect.planner import PaneRow, Plan, PlanRow, find_camera, keep_pace
 from warp_reflect.scene import Scene
 from warp_reflect.settings import Settings, Technique
-from warp_reflect.techniques import MAPS, TECHNIQUES, refraction_image
+from warp_reflect.techniques import MAPS, TECHNIQUES
 from warp_reflect.timing import StageTimer
-from warp_reflect.virtual_objects import virtual_objects
+
+if TYPE_CHECKING:
+    from warp_reflect import transmission
 
 DIRECT = ("Z", "N", "primId")  # of what the eye sees directly
 
@@ -161,6 +161,8 @@ class Frame:
 
     def virtual_objects(self, clip: bool = False) -> list:
         """What the mirrors show as meshes behind them, see `virtual_objects.virtual_objects`."""
+        from warp_reflect.virtual_objects import virtual_objects
+
         return virtual_objects(self.scene, self.camera, self.layers, clip)
 
     def write(
@@ -224,8 +226,10 @@ class Frame:
     def _motion(self) -> wp.array:
         if self._before is None:
             return wp.zeros(self.camera.size[0] * self.camera.size[1], dtype=wp.vec2, device=self.scene.device)
+        from warp_reflect.motion import reflection_motion
+
         threads = self.plan.settings.threads
-        return motion.reflection_motion(self.scene, self.gbuffer, self.layers, *self._before, threads)
+        return reflection_motion(self.scene, self.gbuffer, self.layers, *self._before, threads)
 
     @cached_property
     def _reflection(self) -> dict[str, wp.array]:
@@ -275,8 +279,7 @@ def render_frame(scene: Scene, plan: Plan, camera: str | Camera | None = None, p
         transmitted = {}
         if interfaces is not None:
             with timer("transmission"):
-                through = transmission.Through(shown, interfaces, met)
-                transmitted = _look_through(scene, plan, through, surfaces, picture)
+                transmitted = _look_through(scene, plan, shown, interfaces, met, surfaces, picture)
     timings = timer.ms
     for id in layers.keys() - kept:
         for step, ms in layers[id].timings.items():
@@ -327,11 +330,13 @@ def _interfaces(scene: Scene, plan: Plan) -> transmission.Interfaces | None:
     """How light goes through the transparent surfaces; None where there are none."""
     if not plan.panes:
         return None
+    from warp_reflect.transmission import make_interfaces
+
     finishes = {}
     for pane in plan.panes:
         finish = finish_of(scene.data.materials[scene.parts[pane.part].material], pane.settings)
         finishes[pane.part] = finish if pane.effects["frost"].on else dataclasses.replace(finish, frost=0.0)
-    return transmission.make_interfaces(scene, finishes)
+    return make_interfaces(scene, finishes)
 
 
 def _surfaces(
@@ -358,17 +363,20 @@ def _shown(
     wavy = _wavy(plan)
     if wavy:
         asked = {k: finish_of(scene.data.materials[scene.parts[k].material], each) for k, each in wavy.items()}
-        normals = waves.wave_normals(scene, gbuffer, shown.normals, asked, surfaces, threads, kernels)
+        from warp_reflect.waves import wave_normals
+
+        normals = wave_normals(scene, gbuffer, shown.normals, asked, surfaces, threads, kernels)
         shown = dataclasses.replace(shown, normals=normals)
     met = _met(scene, plan, shown, interfaces, layers)
     if interfaces is None:
         return dataclasses.replace(shown, seen=met), met
+    from warp_reflect.transmission import behind
 
     def seen(layer: ReflectionLayer) -> wp.array:
         radiance = met(layer)
         if layer.radiance is not None:
             return radiance
-        return transmission.behind(scene, gbuffer, interfaces, layer, radiance, plan.settings, met)
+        return behind(scene, gbuffer, interfaces, layer, radiance, plan.settings, met)
 
     return dataclasses.replace(shown, seen=seen), met
 
@@ -394,7 +402,9 @@ def _met(
         radiance = plain(layer)
         if interfaces is None:
             return radiance
-        return transmission.behind(scene, shown.gbuffer, interfaces, layer, radiance, settings, plain)
+        from warp_reflect.transmission import behind
+
+        return behind(scene, shown.gbuffer, interfaces, layer, radiance, settings, plain)
 
     def met(layer: ReflectionLayer) -> wp.array:
         radiance, follow = plain(layer), left.get(layer.pixels.reflector, 0)
@@ -422,16 +432,26 @@ def _has_waves(row: PlanRow | PaneRow) -> bool:
 
 
 def _look_through(
-    scene: Scene, plan: Plan, through: transmission.Through, pixels: dict[int, MirrorPixels], picture: tuple
+    scene: Scene,
+    plan: Plan,
+    shown: shade.Shown,
+    interfaces: transmission.Interfaces,
+    met: transmission.Met,
+    pixels: dict[int, MirrorPixels],
+    picture: tuple,
 ) -> dict[int, transmission.Transmission]:
     """Add to a picture what the eye sees through transparent surfaces; it, by the surfaces' parts."""
-    settings, shown, interfaces = plan.settings, through.shown, through.interfaces
+    from warp_reflect import transmission
+
+    settings, through = plan.settings, transmission.Through(shown, interfaces, met)
     transmitted = {}
     for pane in plan.panes:
         if pane.part not in pixels:
             continue
         follow = None
         if pane.effects["refraction_image"].on:
+            from warp_reflect.techniques import refraction_image
+
             follow = partial(refraction_image.follow, scene, shown.gbuffer, pane.part, settings=pane.settings)
         found = transmission.look_through(scene, shown, interfaces, pixels[pane.part], settings, follow=follow)
         radiance = transmission.through_radiance(scene, through, found, settings)

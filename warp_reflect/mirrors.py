@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from warp_reflect.quadric_roots import MAX_ROOTS
-from warp_reflect.quadrics import FAMILY, RANK_TOLERANCE, CanonicalQuadric, Family, canonical_quadric
+from warp_reflect.quadrics import FAMILY, MAX_ROOTS, RANK_TOLERANCE, CanonicalQuadric, Family, canonical_quadric
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,6 @@ from warp_reflect import (
     kernels,
     mirrored_eyes,
     raster,
-    transmission,
     vector,
 )
 from warp_reflect.applicable import PREFERRED
@@ -26,7 +25,7 @@ from warp_reflect.launch import thread_count
 from warp_reflect.layers import Camera, GBuffer, Reflector
 from warp_reflect.lighting import LightRow, needs_probe, plan_lights, shadows_of
 from warp_reflect.probe import Probe, preview, probe
-from warp_reflect.reflectors import mirror_roughness, mirror_weight
+from warp_reflect.reflectors import interface_of, is_transparent, mirror_roughness, mirror_weight
 from warp_reflect.scene import Note, PartRange, Scene
 from warp_reflect.settings import Settings
 from warp_reflect.shadows import Shadows
@@ -362,7 +361,7 @@ def make_plan(
     notes: list[Note] = []
     weights = _weights(scene, settings) if method != "none" else {}
     found = [(k, part, weight) for k, part in enumerate(scene.parts) if (weight := weights.get(part.material, 0.0))]
-    clear = [k for k, part in enumerate(scene.parts) if transmission.is_transparent(scene, part)]
+    clear = [k for k, part in enumerate(scene.parts) if is_transparent(scene, part)]
     pixels, tried, picture = _look(scene, view, [k for k, _, _ in found], clear, settings)
     lights = plan_lights(scene, tried, settings, costs)
     # What techniques draw themselves is shadowed where the picture is.
@@ -586,7 +585,7 @@ def _row(scene, camera, settings, method, number, part_index, part, weight, pixe
 
 def _pane(scene, camera, settings, method, part_index, pixels) -> PaneRow:
     part = scene.parts[part_index]
-    interface, reason = transmission.interface_of(scene, part_index)
+    interface, reason = interface_of(scene, part_index)
     effects = pane_effects(scene, part, interface, reason, pixels, settings, camera)
     effects["refraction_image"] = refraction_effect(scene, part_index, interface, pixels, settings, camera, method)
     return PaneRow(part_index, part.prim_path, part.subset, part.instance, interface, pixels, effects, settings)

@@ -20,11 +20,10 @@ from __future__ import annotations
 import warp as wp
 
 from warp_reflect.optics import tangent_basis
-from warp_reflect.quadrics import quadric_curve, quadric_half_gradient, quadric_value
+from warp_reflect.quadrics import MAX_ROOTS, quadric_curve, quadric_half_gradient, quadric_value
 
 wp.set_module_options({"enable_backward": False})
 
-MAX_ROOTS = 10  # the degree of the elimination for three different principal values
 SCAN_NODES = 96  # per interval between poles; 10 roots at most are spread over the intervals
 LAST_NODE = wp.float64(SCAN_NODES - 0.25)  # the end itself is a pole or infinity
 SCAN_STEP = wp.float64(1.0 / SCAN_NODES)

@@ -57,6 +57,7 @@ FAMILY = {
     QuadricKind.HYPERBOLIC_PARABOLOID: Family.GENERAL,
 }
 
+MAX_ROOTS = 10  # of the elimination that finds reflection points, for three different principal values: its degree
 RANK_TOLERANCE = {
     np.dtype(np.float64): 1e-13,
     np.dtype(np.float32): 4e-7,

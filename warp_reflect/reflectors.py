@@ -1,4 +1,4 @@
-"""Which surfaces are mirrors."""
+"""Which surfaces are mirrors, and which are looked through."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from warp_reflect.scene import MaterialData, PartRange, Scene, reflectance
 from warp_reflect.settings import Settings
 
 CLEARCOAT_MIN = 0.5  # a coat from here on is a mirror of its own (design: clearcoat >= 0.5)
+INTERFACES = ("opaque", "thin", "solid")  # how light meets a surface
 REC709_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 
@@ -34,3 +35,28 @@ def mirror_weight(scene: Scene, part: PartRange, settings: Settings) -> float:
     if material.roughness <= most and weight >= least:
         return weight
     return 0.0
+
+
+def is_transparent(scene: Scene, part: PartRange) -> bool:
+    """Whether anything is seen through a part."""
+    material = scene.data.materials[part.material]
+    return material.opacity < 1.0 or material.transmission > 0.0
+
+
+def interface_of(scene: Scene, part_index: int) -> tuple[str, str]:
+    """(one of `INTERFACES`, the reason) of a part."""
+    part = scene.parts[part_index]
+    material = scene.data.materials[part.material]
+    if not is_transparent(scene, part):
+        return "opaque", "opacity 1"
+    shares = f"opacity {material.opacity:g}, transmission {material.transmission:g}"
+    if material.transmission == 0.0:
+        return "thin", f"{shares}: partly not there"
+    if material.ior == 1.0:
+        return "thin", f"{shares}, ior 1: nothing bends a ray"
+    asked = material.finish.interface if material.finish is not None else "auto"
+    if asked != "auto":
+        return asked, f"{shares}, ior {material.ior:g}, {asked} as authored"
+    if scene.body(part_index).closed:
+        return "solid", f"{shares}, ior {material.ior:g}, closed: a body"
+    return "thin", f"{shares}, open: a pane"

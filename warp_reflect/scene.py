@@ -664,9 +664,9 @@ class Scene:
                 first_patch = len(patches)
                 for patch in part.patches or (Patch(part.first_triangle, part.triangle_count),):
                     triangle_patch.append(np.full(patch.triangle_count, len(patches), np.int32))
-                    patches.append(
-                        _patch_view(patch, first_triangle, len(self.parts), prim, material, mesh, scene_from_object)
-                    )
+                    own = first_triangle + patch.first_triangle, patch.triangle_count
+                    owners = len(self.parts), prim, material, mesh.double_sided
+                    patches.append((*own, *owners, *_shape_of(patch.shape, scene_from_object)))
                     self.patch_shapes.append(patch.shape)
                 self.parts.append(
                     PartRange(
@@ -701,7 +701,8 @@ class Scene:
         color_index = _stack(color_index, (0, 3), np.int32)
         view.color_index = wp.array(color_index, dtype=wp.vec3i, device=self.device, copy=False)
         view.triangle_patch = wp.array(self.host_triangle_patch, dtype=int, device=self.device, copy=False)
-        view.patches = wp.array(patches, dtype=PatchView, device=self.device)
+        rows = np.array(patches, PatchView.numpy_dtype())
+        view.patches = wp.array(rows, dtype=PatchView, device=self.device)
         view.materials = wp.array([material_view(m) for m in data.materials], dtype=MaterialView, device=self.device)
         self.view = view
 
@@ -745,20 +746,12 @@ def unit_from_scene(shape: Shape, scene_from_object: np.ndarray) -> np.ndarray:
     return (shape.unit_from_object @ np.linalg.inv(scene_from_object)).astype(np.float32)
 
 
-def _patch_view(patch, first_triangle, part, prim, material, mesh, scene_from_object) -> PatchView:
-    view = PatchView()
-    view.first_triangle = first_triangle + patch.first_triangle
-    view.triangle_count = patch.triangle_count
-    view.part = part
-    view.prim = prim
-    view.material = material
-    view.double_sided = int(mesh.double_sided)
-    view.unit_from_scene = wp.mat44(np.eye(4, dtype=np.float32))
-    if patch.shape is not None:
-        view.shape = int(SHAPE_QUADRIC if patch.shape.kind == "quadric" else SHAPE_PLANE)
-        view.quadric = wp.vec3(patch.shape.a, patch.shape.b, patch.shape.c)
-        view.unit_from_scene = wp.mat44(unit_from_scene(patch.shape, scene_from_object))
-    return view
+def _shape_of(shape: Shape | None, scene_from_object: np.ndarray) -> tuple[int, tuple, np.ndarray]:
+    """The last three fields of a `PatchView`."""
+    if shape is None:
+        return SHAPE_NONE, (0.0, 0.0, 0.0), np.eye(4)
+    kind = SHAPE_QUADRIC if shape.kind == "quadric" else SHAPE_PLANE
+    return kind, (shape.a, shape.b, shape.c), unit_from_scene(shape, scene_from_object)
 
 
 def reflectance(material: MaterialData) -> tuple[np.ndarray, np.ndarray]:
@@ -806,7 +799,9 @@ def _scene_origin(data: SceneData) -> np.ndarray:
     middles = [_middle(mesh.points) for mesh in data.meshes]
     for inst in [each for each in data.instances if not each.moves] or data.instances:
         centres.append(inst.world_from_object[:3, :3] @ middles[inst.mesh] + inst.world_from_object[:3, 3])
-    return np.median(np.asarray(centres), axis=0)
+    # Not `np.median`, which imports masked arrays.
+    ordered = np.sort(np.asarray(centres), axis=0)
+    return 0.5 * (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2])
 
 
 def _middle(points: np.ndarray) -> np.ndarray:

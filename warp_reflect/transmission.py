@@ -38,7 +38,8 @@ from warp_reflect.layers import (
 )
 from warp_reflect.normal_maps import prepare_normals
 from warp_reflect.optics import PI, dielectric_reflectance, refract, tangent_basis
-from warp_reflect.scene import SHAPE_NONE, FinishData, PartRange, Scene, SceneView
+from warp_reflect.reflectors import INTERFACES, interface_of
+from warp_reflect.scene import SHAPE_NONE, FinishData, Scene, SceneView
 from warp_reflect.settings import Settings, Technique
 from warp_reflect.shapes import facet_normal, unit
 from warp_reflect.surface import hit_normal, polish, shown_normal
@@ -46,10 +47,10 @@ from warp_reflect.textures import Look, plain_look, prepare_looks
 
 wp.set_module_options({"enable_backward": False})
 
+# Their order is that of `reflectors.INTERFACES`.
 OPAQUE = wp.constant(0)
 THIN = wp.constant(1)
 SOLID = wp.constant(2)
-KINDS = ("opaque", "thin", "solid")
 # Share of the light below which what is behind is not looked for: half a step of an 8 bit picture.
 LEAST_WEIGHT = wp.constant(2.0e-3)
 GOLDEN_ANGLE = wp.constant(2.399963229728653)
@@ -114,31 +115,6 @@ class Transmission:
     nearness: wp.array
 
 
-def is_transparent(scene: Scene, part: PartRange) -> bool:
-    """Whether anything is seen through a part."""
-    material = scene.data.materials[part.material]
-    return material.opacity < 1.0 or material.transmission > 0.0
-
-
-def interface_of(scene: Scene, part_index: int) -> tuple[str, str]:
-    """(one of `KINDS`, the reason) of a part."""
-    part = scene.parts[part_index]
-    material = scene.data.materials[part.material]
-    if not is_transparent(scene, part):
-        return "opaque", "opacity 1"
-    shares = f"opacity {material.opacity:g}, transmission {material.transmission:g}"
-    if material.transmission == 0.0:
-        return "thin", f"{shares}: partly not there"
-    if material.ior == 1.0:
-        return "thin", f"{shares}, ior 1: nothing bends a ray"
-    asked = material.finish.interface if material.finish is not None else "auto"
-    if asked != "auto":
-        return asked, f"{shares}, ior {material.ior:g}, {asked} as authored"
-    if scene.body(part_index).closed:
-        return "solid", f"{shares}, ior {material.ior:g}, closed: a body"
-    return "thin", f"{shares}, open: a pane"
-
-
 @dataclass
 class Interfaces:
     """The surfaces of a scene as light goes through them.
@@ -168,7 +144,7 @@ def make_interfaces(scene: Scene, finishes: Mapping[int, FinishData]) -> Interfa
         kind, _ = interface_of(scene, index)
         part = scene.parts[index]
         own = list(part.patches)
-        views["kind"][own] = KINDS.index(kind)
+        views["kind"][own] = INTERFACES.index(kind)
         views["ior"][own] = scene.data.materials[part.material].ior
         views["spread"][own] = math.tan(math.radians(finish.frost))
         views["fade"][own] = 1.0 / finish.frost_distance if finish.frost_distance > 0.0 else 0.0

@@ -12,6 +12,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
@@ -24,7 +25,7 @@ from warp_reflect.reflector_maps import ReflectorMap, ReflectorMapView
 from warp_reflect.scene import PartRange, Scene
 from warp_reflect.segments import EDGE_SINE_MAX, Segmentation, part_mesh, segment
 from warp_reflect.settings import Settings, Technique
-from warp_reflect.techniques import baking, forward, grid, map_vector, pieces, planar, sheet_branches
+from warp_reflect.techniques import baking, forward, map_vector, pieces, planar, sheet_branches
 from warp_reflect.techniques.map_search import (
     SEARCH_MIDPOINT,
     SearchSettings,
@@ -34,6 +35,9 @@ from warp_reflect.techniques.map_search import (
 )
 from warp_reflect.techniques.pieces import Piece
 from warp_reflect.techniques.vertices import SolveFrame, VertexView, vertices_from
+
+if TYPE_CHECKING:
+    from warp_reflect.techniques import grid
 
 wp.set_module_options({"enable_backward": False})
 
@@ -243,9 +247,11 @@ def prepare(scene: Scene, reflector: Reflector, settings: Settings) -> Prepared 
         device=scene.device,
     )
     drawn = baking.baked_or_drawn(scene, part, faces, resolution, draw)
-    gridded = settings.grid_share > 0.0 or settings.grid_error_px > 0.0
-    cells = grid.build(scene, part) if gridded else None
-    return Prepared(reflector, drawn, drawn.unit_from_body, cells)
+    if settings.grid_share <= 0.0 and settings.grid_error_px <= 0.0:
+        return Prepared(reflector, drawn, drawn.unit_from_body)
+    from warp_reflect.techniques import grid
+
+    return Prepared(reflector, drawn, drawn.unit_from_body, grid.build(scene, part))
 
 
 def _prepare_pieces(scene: Scene, reflector: Reflector, settings: Settings) -> PreparedPieces:
@@ -397,6 +403,8 @@ def reflect(
         if prepared.grid is None or not has_own:
             solve(points, own, frame, warm, out_vertex)
             return
+        from warp_reflect.techniques import grid
+
         counts, cells = grid.fill(
             scene,
             prepared.grid,
