@@ -152,10 +152,17 @@ class MaterialTable:
     intake: Intake
     materials: list[MaterialData] = field(default_factory=list)
     _surfaces: dict = field(default_factory=dict)  # by material prim, or by path where there is no prim
+    _bound: dict = field(default_factory=dict)  # by path of what they are bound to
     _index: dict = field(default_factory=dict)
 
     def bound(self, target) -> Surface | None:
         """The material bound to a prim or GeomSubset; None where there is none that is understood."""
+        path = target.GetPath()
+        if path not in self._bound:
+            self._bound[path] = self._find(target)
+        return self._bound[path]
+
+    def _find(self, target) -> Surface | None:
         binding = UsdShade.MaterialBindingAPI(target)
         try:
             material, relationship = binding.ComputeBoundMaterial(UsdShade.Tokens.full)
