@@ -123,8 +123,9 @@ CASES = {
         twin={"mirror": MaterialData(transmission=1.0, roughness=0.0)},
     ),
 }
-# Their cases take a picture, a stage that moves, a pool: test_bumps.py, test_local_field.py, test_refraction_image.py.
-ELSEWHERE = {"normal_map", "field", "refraction_image"}
+# Their cases take a picture, a stage that moves, a pool: test_bumps.py, test_local_field.py, test_refraction_image.py,
+# test_level_blend.py.
+ELSEWHERE = {"normal_map", "field", "refraction_image", "level_blend"}
 # Effects that launch no kernel of their own: they choose an argument of those that run anyway, or the frame they begin at.
 ARGUMENTS = {"collection", "warm_start", "refraction", "frost_fade", "detail", "kept_map"}
 

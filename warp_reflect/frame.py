@@ -519,9 +519,10 @@ def _same_finish(previous: Frame, scene: Scene, plan: Plan) -> bool:
 
 
 def _answered(previous: Frame, plan: Plan) -> dict[int, ReflectionLayer]:
-    """The layers of a still frame whose rows ask the same again, and no map that is drawn in every frame."""
+    """The layers of a still frame whose rows ask the same again, and no map that is drawn or goes on in every frame."""
     asked, before = ({row.reflector.id: _request(row) for row in each.rows} for each in (plan, previous.plan))
     redrawn = {r.reflector.id for r in plan.rows if r.technique in MAPS and r.settings.environment_update != "static"}
+    redrawn |= {id for id, layer in previous.layers.items() if layer.statistics.get("local_blending")}
     return {id: layer for id, layer in previous.layers.items() if asked[id] == before[id] and id not in redrawn}
 
 

@@ -411,7 +411,7 @@ def _with_detail(scene, camera, settings, rows: list[PlanRow], earlier: Plan | N
     mapped = [row for row in rows if row.technique == "layered_environment" and row.pixels]
     for row in rows:
         seen = "only local maps have one" if row.pixels else "not seen from the camera"
-        row.effects["detail"] = row.effects["kept_map"] = row.effects["field"] = Effect(False, seen)
+        row.effects.update(dict.fromkeys(("detail", "level_blend", "kept_map", "field"), Effect(False, seen)))
     for row in mapped:
         kept = settings.local_keep_px
         told = f"while what it holds has shifted by less than {kept:g} texels in the mean (local_keep_px)"
@@ -423,7 +423,7 @@ def _with_detail(scene, camera, settings, rows: list[PlanRow], earlier: Plan | N
         asked = settings.max_error_px or settings.budget_ms
         why = "a request for an error or a time decides" if asked else "local_detail=0, local_texels=0"
         for row in mapped:
-            row.effects["detail"] = Effect(False, why)
+            row.effects["detail"] = row.effects["level_blend"] = Effect(False, why)
         return rows
     sizes = {row.reflector.id: detail.size_px(scene, camera, row.reflector.part) for row in mapped}
     known = earlier.rows if earlier is not None and earlier.settings == settings else []
@@ -433,6 +433,13 @@ def _with_detail(scene, camera, settings, rows: list[PlanRow], earlier: Plan | N
         if row.reflector.id in found:
             level = found[row.reflector.id]
             row.effects["detail"] = Effect(True, level.reason, level.numbers)
+            blend = settings.local_blend
+            told = (
+                f"no pixel changes by more than {blend:g} grey levels a frame where its map's texels do (local_blend)"
+            )
+            row.effects["level_blend"] = Effect(
+                blend > 0.0, told if blend > 0.0 else "maps switch at once, local_blend=0"
+            )
             own = row.settings.replace(local_resolution=level.resolution)
             ask = (scene, row.reflector, camera, row.technique, row.pixels, own, costs)
             row = dataclasses.replace(row, settings=own, predicted=_predicted(*ask))

@@ -152,6 +152,9 @@ class Settings:
     """Texels along an edge of a local map for each pixel of its mirror's size on screen; 0: all maps have as many."""
     local_texels: int = 0
     """Texels that the local maps of a frame have together at most, those finest for their size give first; 0: no limit."""
+    local_blend: float = 1.0
+    """Grey levels, of 255 in sRGB, by which a mirror's pixel changes at most in a frame because its local map takes another
+    level of detail (`local_detail`, `local_texels`); 0: it switches at once."""
     local_own_size: float = 2.0
     """What moves with a mirror, its vehicle, is not in the mirror's local map where the box around both has at most so many
     times the diagonal of the mirror's; 0: it is shown."""
@@ -278,6 +281,7 @@ class Settings:
         _require(texels == 0 or 4 <= texels <= 4096, "local_resolution", texels, "0 (as reference maps) or 4 to 4096")
         _require(0.0 <= self.local_detail <= 64.0, "local_detail", self.local_detail, "0 (off) to 64 texels a pixel")
         _require(0 <= self.local_texels <= 2**40, "local_texels", self.local_texels, "0 (no limit) or texels")
+        _require(0.0 <= self.local_blend <= 255.0, "local_blend", self.local_blend, "0 (off) to 255 grey levels")
         _require(0.0 <= self.local_own_size <= 1.0e6, "local_own_size", self.local_own_size, "0 (shown) or a ratio")
         _require(0.0 <= self.local_keep_px <= 1.0e6, "local_keep_px", self.local_keep_px, "0 (never) or texels")
         for name in ("fade_distance", "frost_distance"):
@@ -309,6 +313,11 @@ class Settings:
             "0 to 1",
         )
         _require(0.0 <= self.reflector_min_weight <= 1.0, "reflector_min_weight", self.reflector_min_weight, "0 to 1")
+
+    @property
+    def blends_levels(self) -> bool:
+        """Whether a local map that takes another level of detail is blended over."""
+        return self.local_blend > 0.0 and (self.local_detail > 0.0 or self.local_texels > 0)
 
     @property
     def local_edge(self) -> int:

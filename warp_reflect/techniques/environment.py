@@ -42,11 +42,12 @@ class Prepared:
 
 @dataclass(frozen=True)
 class Shown:
-    """What the next frame may start from: the map that this one showed in the mirror `part`."""
+    """What the next frame may start from: the map that this one showed in the mirror `part`, and `level_blend.Levels` of it."""
 
     part: int
     maps: CubeMaps
     number: int
+    levels: tuple[tuple[int, int], ...] = ()
 
 
 def applies(scene: Scene, reflector) -> tuple[bool, str]:

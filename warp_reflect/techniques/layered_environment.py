@@ -105,7 +105,10 @@ def plan_notes(scene: Scene, reflector, settings: Settings) -> list[Note]:
 
 def prepare(scene: Scene, reflector, settings: Settings) -> Prepared:
     """Build the mirror's local map; the scene's reference maps are drawn at first use."""
-    part = reflector.part
+    return _prepared(scene, reflector.part, settings)
+
+
+def _prepared(scene: Scene, part: int, settings: Settings) -> Prepared:
     made = _still_map(scene, part, settings)
     movers = moving_in(scene, part, settings)
     beyond = _beyond(scene, part, made.references.placement.centres, made.references.reach)
@@ -370,14 +373,52 @@ def reflect(
     """Look every mirror pixel up in the mirror's local map.
 
     Args:
-        history: By reflector id the maps of the previous frame.
+        history: By reflector id the maps of the previous frame; where this mirror's had another level of detail, what is shown
+            goes on from it (`level_blend`).
 
     Returns:
         A layer with `radiance` and status CONVERGED (what is shown lies within a texel of the reflected ray), MAX_ITERATIONS
         (it does not), HIDDEN (no reference map sees it, and it was not shaded) or SKY. Statistics: those of the local map
         (`local_rays`, `local_moving`, `local_discontinuities` and `..._traced`, `rem_texels`, `rem_missing`, `rem_shaded`) and
-        `local_settled`: pixels whose ray was found to hit the very triangle that the map holds.
+        `local_settled`: pixels whose ray was found to hit the very triangle that the map holds; `local_blending` 1 where what
+        is shown is on its way from one level of detail to another.
     """
+    layer, local = _looked_up(scene, prepared, pixels, settings, history)
+    levels = ()
+    if settings.blends_levels:
+        levels = _blend_levels(scene, prepared, layer, settings, history)
+        if len(levels) > 1:
+            layer.statistics["local_blending"] = 1
+    layer.history = Shown(prepared.part, local, 0, levels)
+    return layer
+
+
+def _blend_levels(scene: Scene, prepared: Prepared, layer: ReflectionLayer, settings: Settings, history):
+    """Hold a layer's radiance to what its mirror's levels of detail allow, and those: see `level_blend.advanced`."""
+    shown = (history or {}).get(layer.pixels.reflector)
+    before = shown.levels if shown is not None and shown.part == prepared.part else ()
+    edge = settings.local_edge
+    if not before or before == ((edge, 0),):
+        return ((edge, 0),)
+    from warp_reflect.techniques import level_blend  # not compiled where nothing switches
+
+    levels, held, radiance = level_blend.advanced(before, edge), False, None
+    for resolution, frames in levels:
+        looked_up = layer
+        if (resolution, frames) != levels[-1]:
+            own = settings.replace(local_resolution=resolution)
+            other = _prepared(scene, prepared.part, own)
+            looked_up, _ = _looked_up(scene, other, layer.pixels, own, history)
+        if radiance is not None:
+            held = level_blend.approach(radiance, looked_up.radiance, frames, settings.local_blend, settings.threads)
+        radiance = looked_up.radiance
+    return levels if held else ((edge, 0),)
+
+
+def _looked_up(
+    scene: Scene, prepared: Prepared, pixels: MirrorPixels, settings: Settings, history
+) -> tuple[ReflectionLayer, CubeMaps]:
+    """What mirror pixels see in a local map, and that with what moves."""
     layer = ReflectionLayer.empty(pixels, Technique.LAYERED_ENVIRONMENT, scene.device)
     layer.radiance = wp.empty(pixels.count, dtype=wp.vec3, device=scene.device)
     settled = wp.zeros(pixels.count, dtype=wp.uint8, device=scene.device)
@@ -389,6 +430,5 @@ def reflect(
     inputs = [scene.view, scene.lights, local.view, state, settings.parallax_steps, pixels.point, pixels.direction]
     inputs += [layer.triangle, layer.u, layer.v, layer.distance, layer.status, layer.radiance, settled]
     launch.launch(look_up_kernel, pixels.count, inputs, scene.device, settings.threads)
-    layer.history = Shown(prepared.part, local, 0)
     layer.statistics = statistics | {"local_settled": int(settled.numpy().sum())}
-    return layer
+    return layer, local
