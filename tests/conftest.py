@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -156,7 +157,7 @@ def compiled_ahead(request: pytest.FixtureRequest) -> None:
 
 
 @pytest.fixture(scope="session")
-def compiled_for_cuda(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory):
+def compiled_for_cuda(request: pytest.FixtureRequest):
     """Gives the PTX of a kernel module, texts by architecture; what tests will ask for is compiled beside the others."""
     every = request.config.getoption("--all-architectures")
     architectures = ARCHITECTURES if every else (ARCHITECTURES[0], ARCHITECTURES[-1])
@@ -165,9 +166,10 @@ def compiled_for_cuda(request: pytest.FixtureRequest, tmp_path_factory: pytest.T
         texts: dict[int, list[str]] = {}
         for module in kernels.modules_of(name):
             for architecture in architectures:
-                folder = tmp_path_factory.mktemp("ptx")
-                made = wp.compile_aot_module(module, arch=[architecture], module_dir=folder, use_ptx=True)
-                found = [Path(path).read_text() for path in made if Path(path).suffix == ".ptx"]
+                # Not among the tests' own folders: some tests watch those while this runs beside them.
+                with tempfile.TemporaryDirectory() as folder:
+                    made = wp.compile_aot_module(module, arch=[architecture], module_dir=folder, use_ptx=True)
+                    found = [Path(path).read_text() for path in made if Path(path).suffix == ".ptx"]
                 texts.setdefault(architecture, []).extend(found)
         return texts
 
