@@ -208,10 +208,10 @@ def _likely(name: str, value: float) -> float:
 
 def _scene(kind: str, device: wp.DeviceLike) -> Scene:
     """A mirror in a room among balls: a sphere, a square, or a bowl; or the room with a lamp."""
-    mesh, where, cells, balls = _ball(analytic=True), _placed(0.0, 0.0, 0.0), WALL_CELLS, BALLS
+    mesh, where, cells, balls = ball(analytic=True), _placed(0.0, 0.0, 0.0), WALL_CELLS, BALLS
     camera, lights = _placed(0.1, 0.3, 4.0), []
     if kind == "wall":
-        mesh = _square(2, 2.0)
+        mesh = square(2, 2.0)
         where = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, -1.5], [0, 0, 0, 1]])
     elif kind == "hollow":
         mesh = _bowl(mesh)
@@ -230,7 +230,7 @@ def _scene(kind: str, device: wp.DeviceLike) -> Scene:
         if x * x + y * y + z * z > 2.0:
             instances.append(InstanceData(2, _placed(x, y, z, 0.3), f"/ball{balls}", (1,)))
             balls -= 1
-    meshes = [mesh, _square(cells, HALF), _ball()]
+    meshes = [mesh, square(cells, HALF), ball()]
     view = CameraData("/camera", camera, near=0.05, focal_length=22.0)
     return Scene(SceneData("calibration", meshes, instances, [CHROME, MaterialData()], lights, [view]), str(device))
 
@@ -241,7 +241,7 @@ def _placed(x: float, y: float, z: float, scale: float = 1.0) -> np.ndarray:
     return matrix
 
 
-def _ball(analytic: bool = False) -> MeshData:
+def ball(analytic: bool = False) -> MeshData:
     columns = 2 * ROWS
     theta, phi = np.meshgrid(np.linspace(0, np.pi, ROWS + 1), np.arange(columns) * np.pi / ROWS, indexing="ij")
     points = np.stack([np.sin(theta) * np.cos(phi), np.cos(theta), np.sin(theta) * np.sin(phi)], -1)
@@ -264,7 +264,7 @@ def _bowl(ball: MeshData) -> MeshData:
     return dataclasses.replace(ball, triangles=faces, parts=[Part(0, len(faces), patches=(patch,))], double_sided=True)
 
 
-def _square(cells: int, half: float) -> MeshData:
+def square(cells: int, half: float) -> MeshData:
     side = np.linspace(-half, half, cells + 1)
     z, x = np.meshgrid(side, side, indexing="ij")
     points = np.stack([x, 0.0 * x, z], -1).reshape(-1, 3).astype(np.float32)
