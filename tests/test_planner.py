@@ -7,7 +7,7 @@ import pytest
 from rooms import CHROME, identical, placed, plane_room, render, room, sphere
 
 import warp_reflect as wr
-from warp_reflect import launch
+from warp_reflect import launch, probe
 from warp_reflect.scene import MirrorData, Scene
 
 SIZE = (160, 90)
@@ -84,6 +84,52 @@ def test_still_frame_is_made_anew_where_asked_for_or_where_something_moved(ball_
         render(Scene(ball_room.data, str(ball_room.device)), "quadric", previous=first),
     ):
         assert not frame.kept
+
+
+def test_eye_view_drawn_to_decide_is_the_frames_own(ball_room):
+    plan = wr.make_plan(ball_room, size=SIZE)
+    anew = dataclasses.replace(plan, _seen=None, _prepared={})
+    with launch.recorded() as launches:
+        frame = wr.render_frame(ball_room, plan)
+    drawn = [name for name, _ in launches if "raster" in name or "reflector_id" in name or "mirror_pixels" in name]
+    assert not [name for name in drawn if "virtual" not in name and "techniques" not in name], drawn
+    assert frame.timings["raster"] > 0.0 and frame.timings["mirror_pixels"] > 0.0, "what planning drew counts"
+    assert plan.take_view(frame.camera) is None, "it serves one frame"
+    other = wr.render_frame(ball_room, anew)
+    for name in ("RGBA", "reflectorId", "reflectedPoint"):
+        assert np.array_equal(frame[name], other[name]), name
+
+
+def test_eye_view_serves_no_other_camera_and_no_other_mirrors(ball_room):
+    plan = wr.make_plan(ball_room, size=SIZE)
+    away = looking_away(ball_room)
+    assert dataclasses.replace(plan).take_view(away) is None
+    assert dataclasses.replace(plan, rows=[]).take_view(plan.camera) is None
+    assert dataclasses.replace(plan).take_view(plan.camera).pixels[1].count == plan.rows[0].pixels > 0
+
+
+def test_the_same_asked_again_is_decided_by_nothing_new(ball_room):
+    plan = wr.make_plan(ball_room, size=SIZE)
+    with launch.recorded() as launches:
+        again = wr.make_plan(ball_room, plan.camera, SIZE, earlier=plan)
+    assert not launches and again is not plan and str(again) == str(plan)
+    with launch.recorded() as launches:
+        wr.make_plan(ball_room, plan.camera, SIZE, plan.settings.replace(few_pixels=3), earlier=plan)
+    assert launches, "another request is decided anew"
+
+
+def test_small_mirrors_are_tried_at_points_of_their_own():
+    pixel = np.sort(np.random.default_rng(5).choice(10000, 4000, replace=False)).astype(np.int32)
+    grid = np.arange(3, 10000, 7, dtype=np.int32)
+    place, on_grid = probe._some(pixel, grid)
+    assert np.array_equal(pixel[place], np.intersect1d(pixel, grid)) and on_grid.all()
+    few = pixel[:300]
+    place, on_grid = probe._some(few, grid)
+    assert len(place) >= probe.LEAST_TRIED and (np.diff(place) > 0).all()
+    assert np.array_equal(few[place[on_grid]], np.intersect1d(few, grid))
+    place, _ = probe._some(pixel[:5], grid)
+    assert np.array_equal(place, np.arange(5)), "all of fewer"
+    assert not len(probe._some(pixel[:0], grid)[0])
 
 
 def test_one_setting_changed_on_a_still_scene_draws_the_same_pixels_anew(ball_room):

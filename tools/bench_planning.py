@@ -3,9 +3,10 @@
     python tools/bench_planning.py
     python tools/bench_planning.py --prims 2000 --mirrors 20 --stage usd_scenes/toy_room.usda --size 640x360
 
-*Once*: the first plan of a scene of boxes and balls, some of them mirrors; kernels are loaded, nothing is known of the scene.
-*Later*: the plan of a frame whose scene or camera has moved, over that frame's own time. *Without mirrors*: frames of that
-stage planned as ever over frames of plans told to skip reflections (`--method none`), in turn. CPU time of one thread, medians.
+*Once*: the first plan of a scene of balls, some of them mirrors; kernels are loaded, nothing is known of the scene. *Later*: the
+plan of a frame whose scene or camera has moved, over the whole frame's time. The eye's view is drawn for the plan and used by the
+frame: it counts as the frame's. *Without mirrors*: frames of that stage planned as ever over frames of plans told to skip
+reflections (`--method none`), in turn. CPU time of one thread, medians.
 """
 
 from __future__ import annotations
@@ -20,23 +21,40 @@ import numpy as np
 
 import warp_reflect as wr
 from warp_reflect import devices
-from warp_reflect.calibrate import ball, square
-from warp_reflect.scene import CameraData, InstanceData, LightData, MaterialData, Scene, SceneData
+from warp_reflect.calibrate import square
+from warp_reflect.scene import CameraData, InstanceData, LightData, MaterialData, MeshData, Scene, SceneData
+from warp_reflect.timing import counted_by
 
 SIDE = 40.0  # of the floor
 STEP = 0.02  # the camera's, a frame
 CHROME = MaterialData(base_color=(0.9, 0.9, 0.9), metallic=1.0, roughness=0.0)
+ROWS = 8  # of a ball's facets, from pole to pole: 500 balls have 112,000
+
+
+def ball() -> MeshData:
+    """A sphere of radius 1 with its normals."""
+    columns = 2 * ROWS
+    theta, phi = np.meshgrid(np.linspace(0, np.pi, ROWS + 1), np.arange(columns) * np.pi / ROWS, indexing="ij")
+    points = np.stack([np.sin(theta) * np.cos(phi), np.cos(theta), np.sin(theta) * np.sin(phi)], -1)
+    points[0], points[-1] = (0, 1, 0), (0, -1, 0)
+    points = points.reshape(-1, 3).astype(np.float32)
+    i = np.arange(ROWS * columns)
+    right = i // columns * columns + (i + 1) % columns
+    upper, lower = np.stack([i, right, i + columns], 1), np.stack([right, right + columns, i + columns], 1)
+    # Those at the poles have a side of no length.
+    faces = np.concatenate([upper[i >= columns], lower[i < (ROWS - 1) * columns]])
+    return MeshData(points, faces.astype(np.int32), points)
 
 
 def scene_of(prims: int, mirrors: int) -> Scene:
-    """Balls over a floor, one of them a mirror now and then, each with its own matrix and material."""
+    """Balls over a floor, some of them mirrors, each with its own matrix and material."""
     rng = np.random.default_rng(3)
+    shining = {k * (prims - 1) // mirrors for k in range(mirrors)}
     instances = [InstanceData(0, np.eye(4), "/floor", (0,))]
     for k in range(prims - 1):
         world = np.diag([0.3, 0.3, 0.3, 1.0])
         world[:3, 3] = rng.uniform((-SIDE / 2, 0.3, -SIDE / 2), (SIDE / 2, 2.0, SIDE / 2))
-        shines = k % max((prims - 1) // max(mirrors, 1), 1) == 0 and k * mirrors < (prims - 1) * mirrors
-        instances.append(InstanceData(1, world, f"/ball{k}", (1 if shines and mirrors else 2 + k % 8,)))
+        instances.append(InstanceData(1, world, f"/ball{k}", (1 if k in shining else 2 + k % 8,)))
     materials = [MaterialData(), CHROME, *(MaterialData(base_color=(0.1 * k, 0.5, 0.4)) for k in range(8))]
     eye = np.eye(4)
     eye[:3, 3] = 0.0, 3.0, SIDE / 2
@@ -59,17 +77,28 @@ def spent(ask: Callable) -> tuple[object, float]:
     return found, 1e3 * (time.thread_time() - start)
 
 
-def once(prims: int, mirrors: int, size: tuple[int, int], repeats: int) -> float:
+def planned(*asked, **more) -> tuple[wr.Plan, float, float]:
+    """(a plan, milliseconds that deciding took, those of the eye's view that it drew for the frame)."""
+    made, ms = spent(lambda: wr.make_plan(*asked, **more))
+    view = 0.0 if made._seen is None else sum(made._seen.ms.values())
+    return made, ms - view, view
+
+
+def once(prims: int, mirrors: int, size: tuple[int, int], repeats: int) -> tuple[float, float]:
+    """Milliseconds of deciding for a scene that nothing is known of, and for one that is ready to be traced."""
     asked = wr.Settings(threads=1)
     wr.make_plan(scene_of(prims, mirrors), size=size, settings=asked)
-    scenes = [scene_of(prims, mirrors) for _ in range(repeats)]
-    return statistics.median(
-        spent(lambda scene=scene: wr.make_plan(scene, size=size, settings=asked))[1] for scene in scenes
-    )
+    times: dict[bool, list[float]] = {False: [], True: []}
+    for is_ready, found in 2 * repeats * [*times.items()]:
+        scene = scene_of(prims, mirrors)
+        if is_ready:
+            _ = scene.tracer.id, scene.triangle_records, scene.lights, scene.shadow_tracer.id
+        found.append(planned(scene, size=size, settings=asked)[1])
+    return statistics.median(times[False]), statistics.median(times[True])
 
 
-def later(scene: Scene, size: tuple[int, int], frames: int, is_read: bool) -> tuple[float, float]:
-    """(milliseconds of planning, of the rest) of frames whose camera, and stage where it is read, moves."""
+def later(scene: Scene, size: tuple[int, int], frames: int, is_read: bool) -> tuple[float, float, float]:
+    """(milliseconds of deciding, of the eye's view, of the rest) of frames whose camera, and stage where it is read, moves."""
     plan = wr.make_plan(scene, size=size, settings=wr.Settings(threads=1))
     frame = wr.render_frame(scene, plan)
     times = []
@@ -78,12 +107,10 @@ def later(scene: Scene, size: tuple[int, int], frames: int, is_read: bool) -> tu
         eye = plan.camera.eye + STEP * plan.camera.right
         moved = scene.at(first + 1.0 + 0.5 * k) if is_read else scene
         camera = replace(plan.camera, eye=eye)
-        made, planning = spent(
-            lambda moved=moved, camera=camera, plan=plan: wr.make_plan(moved, camera, size, plan.settings, earlier=plan)
-        )
-        frame, rest = spent(lambda moved=moved, made=made, frame=frame: wr.render_frame(moved, made, previous=frame))
-        plan, scene = made, moved
-        times.append((planning, rest))
+        plan, deciding, view = planned(moved, camera, size, plan.settings, earlier=plan)
+        frame, rest = spent(lambda moved=moved, plan=plan, frame=frame: wr.render_frame(moved, plan, previous=frame))
+        scene = moved
+        times.append((deciding, view, rest))
     return tuple(statistics.median(column) for column in zip(*times[2:], strict=True))
 
 
@@ -113,19 +140,21 @@ def main() -> None:
     arguments = parser.parse_args()
     size = tuple(int(side) for side in arguments.size.split("x"))
     devices.open_device("cpu")
-    ms = once(arguments.prims, arguments.mirrors, size, 5)
-    print(f"once, {arguments.prims} prims, {arguments.mirrors} mirrors: {ms:.0f} ms (asked: 100 for 500)")
-    for stage in arguments.stage:
-        scene = wr.load_stage(stage)
-        for is_read in (False, True) if scene.data.time_range else (False,):
-            planning, rest = later(scene, size, arguments.frames, is_read)
-            what = "stage and camera move" if is_read else "camera moves"
-            share = planning / (planning + rest)
-            print(f"later, {stage}, {what}: {planning:.2f} of {planning + rest:.0f} ms, {share:.1%} (asked: 2 %)")
-    planned, told = without_mirrors(size, arguments.frames)
-    print(
-        f"without mirrors: {planned:.1f} ms, told to skip reflections {told:.1f} ms, {planned / told:.3f}x (asked: 1.02)"
-    )
+    with counted_by(time.thread_time):
+        ms, ready = once(arguments.prims, arguments.mirrors, size, 3)
+        print(
+            f"once, {arguments.prims} prims, {arguments.mirrors} mirrors: {ms:.0f} ms, {ready:.0f} of them not for what frames "
+            "trace and shade by (asked: 100 for 500)"
+        )
+        for stage in arguments.stage:
+            scene = wr.load_stage(stage)
+            for is_read in (False, True) if scene.data.time_range else (False,):
+                deciding, view, rest = later(scene, size, arguments.frames, is_read)
+                what = "stage and camera move" if is_read else "camera moves"
+                whole = deciding + view + rest
+                print(f"later, {stage}, {what}: {deciding:.2f} of {whole:.0f} ms, {deciding / whole:.1%} (asked: 2 %)")
+    made, told = without_mirrors(size, arguments.frames)
+    print(f"without mirrors: {made:.1f} ms, told to skip reflections {told:.1f} ms, {made / told:.3f}x (asked: 1.02)")
 
 
 if __name__ == "__main__":

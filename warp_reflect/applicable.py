@@ -128,7 +128,14 @@ def _size_px(pixels: int) -> float:
 
 
 def _relative_size(scene: Scene, part: int) -> float:
-    """Half extent of a mirror over its distance to the nearest box of anything else; infinite inside one."""
+    """Half extent of a mirror over its distance to the nearest box of anything else; infinite inside one. Kept with the scene."""
+    key = "relative size", None, part  # of all parts: known no longer where any has moved
+    if key not in scene.facts:
+        scene.facts[key] = _measured_size(scene, part)
+    return scene.facts[key]
+
+
+def _measured_size(scene: Scene, part: int) -> float:
     own = scene.parts[part]
     faces = scene.host_triangles[own.first_triangle : own.first_triangle + own.triangle_count]
     points = scene.host_points[np.unique(faces)].astype(np.float64)

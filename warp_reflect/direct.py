@@ -244,18 +244,22 @@ def eye_weights_kernel(
     scene: SceneView,
     camera: CameraView,
     triangle: wp.array(dtype=int),
+    pixel: wp.array(dtype=int),
     # Outputs:
     out_direction: wp.array(dtype=wp.vec3),
     out_u: wp.array(dtype=float),
     out_v: wp.array(dtype=float),
 ):
-    """One thread per pixel: its ray, and the weights of the point it meets."""
+    """One thread per pixel (an empty `pixel`: of all of them): its ray, and the weights of the point it meets."""
     i = first + wp.tid()
     tri = triangle[i]
     if tri < 0:
         return
-    row = i // camera.width
-    x = float(i - row * camera.width) + 0.5
+    p = i
+    if pixel.shape[0] > 0:
+        p = pixel[i]
+    row = p // camera.width
+    x = float(p - row * camera.width) + 0.5
     y = float(row) + 0.5
     ray = eye_ray_direction(camera, x, y)
     corner = scene.triangles[tri]
@@ -303,18 +307,27 @@ def direct_kernel(
     out_irradiance[i] = total
 
 
-def points_of(scene: Scene, gbuffer: GBuffer, layer: ReflectionLayer | None = None, threads: int = 0) -> Points:
-    """What a frame shows: the eye's picture, or what is seen in a mirror."""
+def points_of(
+    scene: Scene,
+    gbuffer: GBuffer,
+    layer: ReflectionLayer | None = None,
+    threads: int = 0,
+    chosen: np.ndarray | None = None,
+) -> Points:
+    """What a frame shows: the eye's picture, at all its pixels or at those chosen (int32), or what is seen in a mirror."""
     device, size = scene.device, gbuffer.camera.size
     if layer is not None:
         pixels = layer.pixels
         return Points(layer.triangle, layer.u, layer.v, pixels.direction, pixels.pixel, *size)
-    triangle = gbuffer.triangle
+    triangle, pixel = gbuffer.triangle, wp.zeros(0, dtype=int, device=device)
+    if chosen is not None:
+        triangle = wp.array(triangle.numpy()[chosen], dtype=int, device=device)
+        pixel = wp.array(chosen, dtype=int, device=device)
     direction = wp.zeros(len(triangle), dtype=wp.vec3, device=device)
     u, v = (wp.zeros(len(triangle), dtype=float, device=device) for _ in range(2))
-    inputs = [scene.view, gbuffer.view, triangle, direction, u, v]
+    inputs = [scene.view, gbuffer.view, triangle, pixel, direction, u, v]
     launch.launch(eye_weights_kernel, len(triangle), inputs, device, threads)
-    return Points(triangle, u, v, direction, wp.zeros(0, dtype=int, device=device), *size)
+    return Points(triangle, u, v, direction, pixel, *size)
 
 
 def direct_irradiance(

@@ -17,7 +17,7 @@ from warp_reflect import (
     images,
     kernels,
     mirrored_eyes,
-    raster,
+    probe,
     shade,
     surface,
 )
@@ -483,16 +483,11 @@ def _finish(scene: Scene, plan: Plan) -> shade.Finish | None:
 
 def _look(scene: Scene, plan: Plan, view: Camera, timer: StageTimer) -> tuple[GBuffer, dict[int, MirrorPixels]]:
     """What the eye sees, and the pixels of every mirror."""
-    threads = plan.settings.threads
-    with timer("raster"):
-        gbuffer = plan.take_picture(view)
-        if gbuffer is None:
-            gbuffer = raster.draw_scene(scene, view, threads, kernels=plan.settings.kernels)
-    with timer("mirror_pixels"):
-        pixels, gbuffer.reflector_id = surface.mirror_pixels(
-            scene, gbuffer, _mirrors(plan), threads, plan.settings.kernels
-        )
-    return gbuffer, pixels
+    seen = plan.take_view(view)
+    if seen is None:
+        seen = probe.look(scene, view, _mirrors(plan), plan.settings.threads, plan.settings.kernels)
+    timer.count(seen.ms)
+    return seen.gbuffer, seen.pixels
 
 
 def _mirrors(plan: Plan) -> dict[int, int]:

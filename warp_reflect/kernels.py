@@ -47,22 +47,28 @@ GLOSSY = {
 
 def of_eye(settings: Settings, device: wp.DeviceLike) -> list[str]:
     """Those of every frame: known before its stage is read."""
-    return [*of_preview(settings, device), *_of(["|shade_vector", "-shade/plain"], vectors(settings, device))]
+    return [*of_view(settings, device), *_of(["|shade_vector", "-shade/plain"], vectors(settings, device))]
 
 
-def of_preview(settings: Settings, device: wp.DeviceLike, casting: bool = False, mirrors: bool = False) -> list[str]:
+def of_view(settings: Settings, device: wp.DeviceLike, casting: bool = False, mirrors: bool = False) -> list[str]:
     """Those that planning launches where it looks at a scene.
 
     Args:
         settings, device: The plan's and the scene's.
         casting: Points are tried for what shadows do to them.
-        mirrors: So they are in mirrors that are seen.
+        mirrors: There are some, seen or not.
     """
     asked = ["|vector", "raster", "|raster_vector", "-raster/plain"]
+    if mirrors:
+        asked += ["surface"]
     if casting:
         asked += ["direct", "|shadows_vector", "-shadows/tried"]
-    if mirrors:
-        asked += ["surface", "|surface_vector", "-surface/plain", "bvh", "|bvh_vector"]
+    return _of(asked, vectors(settings, device))
+
+
+def of_mirrors(settings: Settings, device: wp.DeviceLike, casting: bool) -> list[str]:
+    """Those that planning launches once mirrors are seen; `casting` as for `of_view`."""
+    asked = ["|surface_vector", "-surface/plain", *(["bvh", "|bvh_vector"] if casting else [])]
     return _of(asked, vectors(settings, device))
 
 

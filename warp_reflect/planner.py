@@ -24,7 +24,7 @@ from warp_reflect.effects import Effect, bounce_effect, finish_effects, pane_eff
 from warp_reflect.launch import thread_count
 from warp_reflect.layers import Camera, GBuffer, Reflector
 from warp_reflect.lighting import LightRow, needs_probe, plan_lights, shadows_of
-from warp_reflect.probe import Probe, preview, probe
+from warp_reflect.probe import EyeView, Probe, look, probe
 from warp_reflect.reflectors import interface_of, is_transparent, mirror_roughness, mirror_weight
 from warp_reflect.scene import Note, PartRange, Scene
 from warp_reflect.settings import Settings
@@ -38,6 +38,7 @@ DEFAULT_SIZE = (960, 540)  # usdrecord's default width at 16:9
 # Of a time asked for: a frame that takes more is late, and what is dearer may be predicted to take as much; between them a
 # choice stands.
 LATE, ROOM = 1.05, 0.95
+GLANCE = 97  # pixels from one to the next that are asked for mirrors, so that kernels of theirs begin to compile early
 BETTER = 0.8  # of the error: what a dearer choice has to come down to, else the last one stands
 
 
@@ -118,7 +119,7 @@ class Plan:
     _prepared: dict[int, object] = field(default_factory=dict)
     _prepared_in_mirrors: dict[tuple[int, str], object] = field(default_factory=dict)
     _ways: dict[int, list[choice.Option]] = field(default_factory=dict)
-    _picture: GBuffer | None = None  # what the plan's camera sees, drawn to decide: the first frame's
+    _seen: EyeView | None = None  # what the plan's camera sees, drawn to decide: the first frame's
     _told: int = 0  # of the notes, the last: those of the request for an error or a time
 
     @property
@@ -181,11 +182,13 @@ class Plan:
             self._prepared[row.reflector.id] = technique.prepare(self.scene, row.reflector, row.settings)
         return self._prepared[row.reflector.id]
 
-    def take_picture(self, view: Camera) -> GBuffer | None:
-        """What a camera sees of the plan's scene, where that was drawn to decide; for one frame, which completes it."""
-        picture, self._picture = self._picture, None
-        same = picture is not None and picture.camera.sees_as(view)
-        return dataclasses.replace(picture, camera=view) if same else None
+    def take_view(self, camera: Camera) -> EyeView | None:
+        """What a camera sees of the plan's scene and mirrors, where that was drawn to decide; for one frame."""
+        seen, self._seen = self._seen, None
+        same = seen is not None and seen.gbuffer.camera.sees_as(camera)
+        if not same or seen.parts != {row.reflector.id: row.reflector.part for row in self.rows}:
+            return None
+        return dataclasses.replace(seen, gbuffer=dataclasses.replace(seen.gbuffer, camera=camera))
 
     def at(self, scene: Scene, last: Plan | None = None) -> Plan:
         """The plan for its stage at another time: decided anew, with its own camera there.
@@ -355,14 +358,18 @@ def make_plan(
         near = difflib.get_close_matches(method, [*METHODS, *TECHNIQUES], n=3, cutoff=0.3)
         raise ValueError(f"unknown method '{method}'; nearest: {', '.join(near or [*METHODS, *TECHNIQUES])}")
     view = find_camera(scene, camera, size)
+    if earlier is not None and _asks_the_same(earlier, scene, view, settings, method, costs):
+        return dataclasses.replace(
+            earlier, scene=scene, camera=view, rows=list(earlier.rows), notes=list(earlier.notes)
+        )
     if earlier is not None and not earlier.scene.shares_world(scene):
         for name in {row.technique for row in earlier.rows} & set(OF_ALL_TIMES):
             TECHNIQUES[name].take_over(earlier.scene, scene)
     notes: list[Note] = []
-    weights = _weights(scene, settings) if method != "none" else {}
-    found = [(k, part, weight) for k, part in enumerate(scene.parts) if (weight := weights.get(part.material, 0.0))]
-    clear = [k for k, part in enumerate(scene.parts) if is_transparent(scene, part)]
-    pixels, tried, picture = _look(scene, view, [k for k, _, _ in found], clear, settings)
+    found, clear, rough = _surfaces(scene, settings)
+    if method == "none":
+        found = []
+    pixels, tried, seen = _look(scene, view, [k for k, _, _ in found], clear, settings)
     lights = plan_lights(scene, tried, settings, costs)
     # What techniques draw themselves is shadowed where the picture is.
     cast = shadows_of(lights, settings)
@@ -384,14 +391,21 @@ def make_plan(
         row.effects["second_bounce"] = bounce
         row.effects["shadows"] = _shadows(lights, visible)
     panes = [_pane(scene, view, settings, method, k, pixels[k]) for k in clear]
-    notes += _too_rough(scene, settings, weights)
+    notes += rough if method != "none" else _too_rough(scene, settings, {})
     if settings.kernels != "plain" and not scene.device.is_cuda and vector.missing():
         notes.append(Note("", f"plain kernels only: {vector.missing()} (kernels={settings.kernels})"))
     rows = _with_detail(scene, view, settings, rows, earlier, costs)
-    made = Plan(scene, view, settings, method, rows, panes, notes, lights, costs, _picture=picture)
+    made = Plan(scene, view, settings, method, rows, panes, notes, lights, costs, _seen=seen)
     _fit(made, choice.Pace() if earlier is None else earlier.pace)
     _take_over(made, earlier)
     return made
+
+
+def _asks_the_same(earlier: Plan, scene: Scene, view: Camera, settings: Settings, method: str, costs: Costs) -> bool:
+    """Whether a plan is the answer again: the same request of the same world from the same eye, and no time was asked for."""
+    asked = settings, method, costs
+    still = earlier.scene.shares_world(scene) and earlier.camera.sees_as(view)
+    return still and (earlier.settings, earlier.method, earlier.costs) == asked and settings.budget_ms == 0.0
 
 
 def _field_effect(scene: Scene, row: PlanRow) -> Effect:
@@ -461,6 +475,17 @@ def _too_rough(scene: Scene, settings: Settings, weights: dict[int, float]) -> l
             text += " (reflector_max_roughness): no mirror; what it reflects is scattered"
             notes.append(Note(material.path or part.prim_path, text))
     return list(dict.fromkeys(notes))
+
+
+def _surfaces(scene: Scene, settings: Settings) -> tuple[list[tuple[int, PartRange, float]], list[int], list[Note]]:
+    """((part, its range, its weight) of every mirror; the transparent parts; `_too_rough`); kept with the scene."""
+    key = "surfaces", None, settings.reflector_max_roughness, settings.reflector_min_weight
+    if key not in scene.facts:
+        weights = _weights(scene, settings)
+        found = [(k, part, weight) for k, part in enumerate(scene.parts) if (weight := weights.get(part.material, 0.0))]
+        clear = [k for k, part in enumerate(scene.parts) if is_transparent(scene, part)]
+        scene.facts[key] = found, clear, _too_rough(scene, settings, weights)
+    return scene.facts[key]
 
 
 def _weights(scene: Scene, settings: Settings) -> dict[int, float]:
@@ -549,21 +574,26 @@ def find_camera(scene: Scene, camera: str | Camera | None, size: tuple[int, int]
 
 def _look(
     scene: Scene, camera: Camera, mirrors: list[int], panes: list[int], settings: Settings
-) -> tuple[dict[int, int], Probe | None, GBuffer | None]:
-    """(pixels of each part; what lights and bounces are decided by, if they are; the whole picture, if it was drawn)."""
+) -> tuple[dict[int, int], Probe | None, EyeView | None]:
+    """(pixels of each part; what lights and bounces are decided by, if they are; what the camera sees, if it was drawn)."""
     casting = needs_probe(scene, settings)
     if not scene.triangle_count or not (mirrors or panes or casting):
         return dict.fromkeys([*mirrors, *panes], 0), None, None
-    kernels.begin(kernels.of_preview(settings, scene.device, casting), scene.device)
-    small = preview(scene, camera, settings.threads, settings.kernels)
-    pixels, picture = small.pixels_of(scene, [*mirrors, *panes]), small.gbuffer if small.scale == 1.0 else None
-    if casting and any(pixels[k] for k in mirrors):
-        kernels.begin(kernels.of_preview(settings, scene.device, casting, True), scene.device)
-    seen = [k for k in mirrors if pixels[k] >= max(settings.few_pixels, 1)]
-    facing = settings.bounces > 1 and (len(mirrors) > 1 or any(not scene.body(k).convex for k in seen))
+    kernels.begin(kernels.of_view(settings, scene.device, casting, bool(mirrors)), scene.device)
+
+    def begin_mirrors(gbuffer: GBuffer) -> None:
+        some = gbuffer.triangle.numpy()[::GLANCE]
+        patches = {k for part in mirrors for k in scene.parts[part].patches}
+        if patches & set(scene.host_triangle_patch[some[some >= 0]].tolist()):
+            kernels.begin(kernels.of_mirrors(settings, scene.device, casting), scene.device)
+
+    seen = look(scene, camera, dict(enumerate(mirrors, 1)), settings.threads, settings.kernels, begin_mirrors)
+    pixels = seen.pixels_of(scene, [*mirrors, *panes])
+    clear = [k for k in mirrors if pixels[k] >= max(settings.few_pixels, 1)]
+    facing = settings.bounces > 1 and (len(mirrors) > 1 or any(not scene.body(k).convex for k in clear))
     if not (casting or facing):
-        return pixels, None, picture
-    return pixels, probe(scene, small, mirrors, settings.threads, settings.kernels), picture
+        return pixels, None, seen
+    return pixels, probe(scene, seen, settings.threads, settings.kernels), seen
 
 
 def _row(scene, camera, settings, method, number, part_index, part, weight, pixels, notes, costs) -> PlanRow:

@@ -1,8 +1,8 @@
-"""A small picture of what a camera sees, for plans: pixels of every mirror, and a few points that are looked at closer."""
+"""What a camera sees, for plans: pixels of every mirror, and a few points that are looked at closer."""
 
 from __future__ import annotations
 
-import dataclasses
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,36 +10,39 @@ import warp as wp
 
 from warp_reflect import bvh, raster, surface
 from warp_reflect.direct import Points, points_of
-from warp_reflect.layers import Camera, GBuffer, ReflectionLayer
+from warp_reflect.layers import Camera, GBuffer, MirrorPixels, ReflectionLayer
 from warp_reflect.scene import Scene
 from warp_reflect.settings import Technique
+from warp_reflect.timing import StageTimer
 
-PREVIEW_SIDE = 320  # pixels; enough to count a mirror's pixels within a few per cent for the choice of technique
-# Pixels of the picture for each triangle of the scene, up to which drawing it whole costs little more than drawing it small,
-# and the frame is spared it.
-WHOLE_PIXELS = 4
-STRIDE = 3  # pixels of the preview from one point to the next; odd, so that it falls in step with few patterns
+TRIED_SIDE = 64  # points along the longer side of a picture: 2,300 tell a share of 1 % within 0.2 %
+LEAST_TRIED = 64  # points of a mirror, however small: whether it shows another is decided by them alone
 
 
 @dataclass(frozen=True)
-class Preview:
-    """The eye's view in few pixels.
+class EyeView:
+    """What a camera sees, drawn to decide: the first frame's own view, which is so spared it.
 
     Attributes:
-        gbuffer: What is seen.
-        scale: Pixels of the picture for each of the preview's.
-        stride: Pixels from one point that is tried to the next.
+        gbuffer: With the mirrors' ids.
+        pixels: By reflector id, as `surface.mirror_pixels` has them.
+        parts: Reflector id to part of the scene.
+        ms: What that took, by the names of a frame's steps.
     """
 
     gbuffer: GBuffer
-    scale: float
-    stride: int = STRIDE
+    pixels: dict[int, MirrorPixels]
+    parts: dict[int, int]
+    ms: dict[str, float]
 
     def pixels_of(self, scene: Scene, parts: list[int]) -> dict[int, int]:
         """Pixels of the picture that show each part."""
-        triangle = self.gbuffer.triangle.numpy()
-        patches = np.bincount(scene.host_triangle_patch[triangle[triangle >= 0]], minlength=len(scene.patch_shapes))
-        return {k: round(float(patches[list(scene.parts[k].patches)].sum()) * self.scale) for k in parts}
+        found = {part: self.pixels[number].count for number, part in self.parts.items()}
+        others = [part for part in parts if part not in found]
+        if others:
+            seen = surface.seen_parts(scene, self.gbuffer, others)
+            found |= {part: len(seen.get(part, ())) for part in others}
+        return found
 
 
 @dataclass(frozen=True)
@@ -57,64 +60,84 @@ class Probe:
     mirrored: dict[int, dict[int, float]]
 
 
-def preview(scene: Scene, camera: Camera, threads: int = 0, kernels: str = "auto") -> Preview:
-    """Draw a scene small, or whole where that is as cheap; `kernels` as in `Settings`."""
-    width, height = camera.size
-    shrink = smaller = max(1.0, max(width, height) / PREVIEW_SIDE)
-    if width * height <= WHOLE_PIXELS * scene.triangle_count:
-        shrink = 1.0
-    small = dataclasses.replace(
-        camera,
-        size=(max(1, round(width / shrink)), max(1, round(height / shrink))),
-        fx=camera.fx / shrink,
-        fy=camera.fy / shrink,
-        cx=camera.cx / shrink,
-        cy=camera.cy / shrink,
-    )
-    gbuffer = raster.draw_scene(scene, small, threads, kernels=kernels)
-    stride = int(STRIDE * smaller / shrink) | 1
-    return Preview(gbuffer, width * height / (small.size[0] * small.size[1]), stride)
+def look(
+    scene: Scene,
+    camera: Camera,
+    parts: Mapping[int, int],
+    threads: int = 0,
+    kernels: str = "auto",
+    drawn: Callable[[GBuffer], None] | None = None,
+) -> EyeView:
+    """Draw what a camera sees.
+
+    Args:
+        scene, camera: What, from where.
+        parts: Reflector id (1-based) to part of the scene.
+        threads: CPU threads; 0: one per core.
+        kernels: `Settings.kernels`.
+        drawn: Told what is seen before the mirrors' pixels are taken from it.
+    """
+    timer = StageTimer(scene.device)
+    with timer("raster"):
+        gbuffer = raster.draw_scene(scene, camera, threads, kernels=kernels)
+    if drawn is not None:
+        drawn(gbuffer)
+    with timer("mirror_pixels"):
+        pixels, gbuffer.reflector_id = surface.mirror_pixels(scene, gbuffer, parts, threads, kernels)
+    return EyeView(gbuffer, pixels, dict(parts), timer.ms)
 
 
-def probe(scene: Scene, small: Preview, parts: list[int], threads: int = 0, kernels: str = "auto") -> Probe:
-    """Try every `stride`-th point of a preview in both directions, and what mirrors show there.
+def probe(scene: Scene, seen: EyeView, threads: int = 0, kernels: str = "auto") -> Probe:
+    """Try points on a coarse grid of what is seen, and what mirrors show there.
 
     Args:
         scene: Its BVH is built if there are mirrors and this is the first use.
-        small: Of the scene.
-        parts: The reflectors, indices into `scene.parts`.
-        threads: CPU threads.
+        seen: Of the scene.
+        threads: CPU threads; 0: one per core.
         kernels: `Settings.kernels`.
     """
-    gbuffer = small.gbuffer
+    gbuffer = seen.gbuffer
     width, height = gbuffer.camera.size
-    row, column = np.divmod(np.arange(width * height), width)
-    chosen = (row % small.stride == small.stride // 2) & (column % small.stride == small.stride // 2)
+    stride = max(width, height) // TRIED_SIDE | 1  # odd, so that it falls in step with few patterns
+    rows, columns = (np.arange(stride // 2, side, stride) for side in (height, width))
+    chosen = (rows[:, None] * width + columns).ravel().astype(np.int32)
     triangle = gbuffer.triangle.numpy()
-    found = [_taken(points_of(scene, gbuffer, None, threads), np.flatnonzero(chosen & (triangle >= 0)))]
-    count = float(np.count_nonzero(triangle >= 0))
-    ids = dict(enumerate(parts, 1))
+    there = triangle[chosen] >= 0
+    points = points_of(scene, gbuffer, None, threads, chosen[there])
+    found = [_taken(points, slice(None))]
+    count = width * height * float(there.mean())
     mirrored: dict[int, dict[int, float]] = {}
-    pixels, _ = surface.mirror_pixels(scene, gbuffer, ids, threads, kernels)
     mirror_of_patch = np.full(max(len(scene.patch_shapes), 1), -1)
-    for part in parts:
+    for part in seen.parts.values():
         mirror_of_patch[list(scene.parts[part].patches)] = part
-    for number, part in ids.items():
-        own = pixels[number]
-        some = np.flatnonzero(chosen[own.pixel.numpy()])
+    for number, part in seen.parts.items():
+        own = seen.pixels[number]
+        some, on_grid = _some(own.pixel.numpy(), chosen)
         if not len(some):
             continue
         layer = ReflectionLayer.empty(own.select(some, number, width), Technique.RAYTRACED, scene.device)
         bvh.trace_pixels(scene, gbuffer, layer.pixels, layer, part, False, threads=threads, kernels=kernels)
         shown = layer.triangle.numpy()
-        seen, times = np.unique(mirror_of_patch[scene.host_triangle_patch[shown[shown >= 0]]], return_counts=True)
-        mirrored[part] = {int(k): float(n) / len(shown) for k, n in zip(seen, times, strict=True) if k >= 0}
-        found.append(_taken(points_of(scene, gbuffer, layer, threads), np.flatnonzero(shown >= 0)))
+        met, times = np.unique(mirror_of_patch[scene.host_triangle_patch[shown[shown >= 0]]], return_counts=True)
+        mirrored[part] = {int(k): float(n) / len(shown) for k, n in zip(met, times, strict=True) if k >= 0}
+        found.append(_taken(points_of(scene, gbuffer, layer, threads), np.flatnonzero((shown >= 0) & on_grid)))
         count += own.count * float((shown >= 0).mean())
-    return Probe(_joined(found, (width, height), scene.device), round(count * small.scale), mirrored)
+    return Probe(_joined(found, (width, height), scene.device), round(count), mirrored)
 
 
-def _taken(points: Points, rows: np.ndarray) -> tuple[np.ndarray, ...]:
+def _some(pixel: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(places of those of a mirror's pixels that are tried, which of them are pixels of the grid), both ascending."""
+    place = np.searchsorted(pixel, grid)
+    inside = place < len(pixel)
+    place = place[inside]
+    place = place[pixel[place] == grid[inside]]
+    if len(place) >= min(LEAST_TRIED, len(pixel)):
+        return place, np.ones(len(place), bool)
+    more = np.union1d(place, np.arange(0, len(pixel), max(len(pixel) // LEAST_TRIED, 1)))
+    return more, np.isin(more, place)
+
+
+def _taken(points: Points, rows: np.ndarray | slice) -> tuple[np.ndarray, ...]:
     return tuple(array.numpy()[rows] for array in (points.triangle, points.u, points.v, points.direction))
 
 

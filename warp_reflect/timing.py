@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from time import perf_counter
 
@@ -61,6 +61,11 @@ class StageTimer:
         finally:
             self.ms[full] += 1000.0 * (clock() - start) - (loading_ms() - loading)
             self._open.pop()
+
+    def count(self, ms: Mapping[str, float]) -> None:
+        """Add what was spent before, under the names of outermost stages."""
+        for name, spent in ms.items():
+            self.ms[name] = self.ms.get(name, 0.0) + spent
 
     @property
     def total_ms(self) -> float:

@@ -8,6 +8,7 @@ mirror's plane, where the virtual and the real point coincide; depth keeps its r
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -99,8 +100,8 @@ def applies(
     if camera is None or flat:
         return flat, reason
     plane, height, sine = _flatness(scene, part)
-    points = scene.host_points[np.unique(_corners(scene, part))].astype(np.float64)
-    nearest = float(np.linalg.norm(points - (camera.eye - scene.origin), axis=1).min())
+    from_eye = _points(scene, part) - (camera.eye - scene.origin)
+    nearest = math.sqrt(float(np.einsum("ij,ij->i", from_eye, from_eye).min()))
     # A plane moved by h moves its picture by 2 h, a normal turned by an angle turns the ray by twice that.
     radians = 2.0 * (sine + height * plane[2] / max(nearest, 1.0e-300))
     shift = radians * max(camera.fx, camera.fy)
@@ -185,6 +186,14 @@ def reflect(
 
 def _corners(scene: Scene, part: PartRange) -> np.ndarray:
     return scene.host_triangles[part.first_triangle : part.first_triangle + part.triangle_count]
+
+
+def _points(scene: Scene, part: PartRange) -> np.ndarray:
+    """The points of a part, each once, scene frame; kept with the scene."""
+    key = "points", part.first_triangle
+    if key not in scene.facts:
+        scene.facts[key] = scene.host_points[np.unique(_corners(scene, part))].astype(np.float64)
+    return scene.facts[key]
 
 
 def _flatness(scene: Scene, part: PartRange):

@@ -182,18 +182,27 @@ def has_branches(scene: Scene, reflector: Reflector, camera: Camera) -> bool:
     """Whether the eye sees the hollow side of a sheet, on which every vertex may appear several times."""
     if _one_map(scene, reflector.part):
         return False
-    points, faces, _ = part_mesh(scene, scene.parts[reflector.part])
     closed = scene.body(reflector.part).closed
     eye = camera.eye - scene.origin
-    for sheet in scene_segments(scene, reflector.part).segments:
-        corner = points[faces[sheet.triangles]].astype(np.float64)
-        facing = np.einsum(
-            "ij,ij->i", np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), eye - corner[:, 0]
-        )
+    for kind, corner, area in _facets(scene, reflector.part):
+        facing = np.einsum("ij,ij->i", area, eye - corner)
         front, back = (facing > 0.0).any(), (facing < 0.0).any() and not closed
-        if (sheet.kind == "concave" and front) or (sheet.kind == "convex" and back):
+        if (kind == "concave" and front) or (kind == "convex" and back):
             return True
     return False
+
+
+def _facets(scene: Scene, part: int) -> list[tuple[str, np.ndarray, np.ndarray]]:
+    """(kind of a sheet, a corner and twice the area of each facet of it) of a part; kept with the scene."""
+    key = "facets", scene.parts[part].first_triangle
+    if key not in scene.facts:
+        points, faces, _ = part_mesh(scene, scene.parts[part])
+        found = []
+        for sheet in scene_segments(scene, part).segments:
+            a, b, c = points[faces[sheet.triangles]].astype(np.float64).transpose(1, 0, 2)
+            found.append((sheet.kind, a, np.cross(b - a, c - a)))
+        scene.facts[key] = found
+    return scene.facts[key]
 
 
 def scene_segments(scene: Scene, part: int) -> Segmentation:
