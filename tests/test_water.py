@@ -299,12 +299,14 @@ from panes import WATER, frame, stage
 from rooms import placed, square
 shown = frame(stage((square(1, 20.0), placed(0, 0, -3), WATER)))
 assert (shown["reflectorId"] > 0).sum() > 500
-module = wp._src.context.user_modules["warp_reflect.waves"]
-print(bool(module.execs), [name for name in sys.modules if name.startswith("warp_reflect.finishes")])
+modules = [*sys.modules, *wp._src.context.user_modules]
+assert "warp_reflect.shade" in modules
+print([name for name in modules if name.startswith(("warp_reflect.finishes", "warp_reflect.waves"))])
+import warp_reflect.waves  # so that a name that has changed does not pass
 """
 
 
 def test_nothing_of_waves_is_compiled_for_still_water():
     run = [sys.executable, "-c", STILL_FRAME]
     done = subprocess.run(run, cwd=Path(__file__).parent, capture_output=True, text=True, check=True)
-    assert done.stdout.strip().split("\n")[-1] == "False []"
+    assert done.stdout.strip().split("\n")[-1] == "[]"
