@@ -13,7 +13,7 @@ from test_layered_environment import plan_of
 import warp_reflect as wr
 from warp_reflect.cubemap import texel_directions
 from warp_reflect.environment_maps import empty_maps
-from warp_reflect.techniques import layered_environment, local_map, local_movers
+from warp_reflect.techniques import environment, layered_environment, local_map, local_movers
 
 
 def car_stage(path, trailer: bool = False):
@@ -86,16 +86,17 @@ def test_its_own_vehicle_is_not_in_a_mirrors_map(tmp_path):
 def test_a_small_mirror_shows_the_large_vehicle_it_sits_on(tmp_path, size, vehicle):
     scene = load(tmp_path / "car.usda", trailer=True)
     settings = wr.Settings(local_own_size=size)
-    assert named(scene, local_movers.vehicle_of(scene, ball(scene), settings)) == vehicle
+    assert named(scene, environment.vehicle_of(scene, ball(scene), settings)) == vehicle
+    assert named(scene, environment.left_out(scene, ball(scene), settings)) == {"Ball", *vehicle}
     still = next(k for k, part in enumerate(scene.parts) if part.prim_path.endswith("Ground"))
-    assert local_movers.vehicle_of(scene, still, settings) == ()
+    assert environment.vehicle_of(scene, still, settings) == ()
 
 
 def test_vehicles_hold_in_time(tmp_path):
     scene = load(tmp_path / "car.usda")
     later = scene.at(3.0)
     layered_environment.take_over(scene, later)
-    assert named(later, local_movers.vehicle_of(later, ball(later), wr.Settings())) == {"Mast", "Wheel"}
+    assert named(later, environment.vehicle_of(later, ball(later), wr.Settings())) == {"Mast", "Wheel"}
 
 
 @pytest.mark.parametrize("size", [-1.0, 1e7, float("nan")])

@@ -37,7 +37,7 @@ def test_mirror_in_a_map_shows_its_own_map(device):
     first, second = (k for k, part in enumerate(scene.parts) if part.prim_path in ("/mirror", "/second"))
     settings = wr.Settings(environment_resolution=EDGE, shadows="off", bounces=2)
     centres = np.array([environment.centre_of(scene, part) for part in (first, second)])
-    options = {"without": [environment.left_out(scene, part) for part in (first, second)]}
+    options = {"without": [environment.left_out(scene, part, settings) for part in (first, second)]}
     plain = environment_maps.render_maps(scene, centres, EDGE, **options)
     onward = mirror_maps.of_depth(scene, settings, 1)
     deep = environment_maps.render_maps(scene, centres, EDGE, onward=onward, **options)

@@ -26,7 +26,7 @@ from warp_reflect.cubemap import RADIANCE_AXES, texel_directions
 from warp_reflect.devices import open_device
 from warp_reflect.shadows import asked_shadows
 from warp_reflect.techniques import layered_environment, local_map, local_mesh, reference_maps
-from warp_reflect.techniques.environment import centre_of
+from warp_reflect.techniques.environment import centre_of, left_out
 
 DEPTH_APART = 0.05  # of a distance: what is shown and lies farther off than this is another thing
 PALETTE_BYTES = 1024 * 8
@@ -106,7 +106,7 @@ def measure(scene, part: int, references, settings, rounds: int, when: float) ->
     """One mirror's row; the first of each contender's turns is not counted."""
     centre = centre_of(scene, part)
     shadows = asked_shadows(scene, settings)
-    without = [(part,)]
+    without = [left_out(scene, part, settings)]
     local, drawn = [], []
     for turn in range(rounds + 1):
         start = time.process_time()

@@ -156,7 +156,7 @@ class Settings:
     """Grey levels, of 255 in sRGB, by which a mirror's pixel changes at most in a frame because its local map takes another
     level of detail (`local_detail`, `local_texels`); 0: it switches at once."""
     local_own_size: float = 2.0
-    """What moves with a mirror, its vehicle, is not in the mirror's local map where the box around both has at most so many
+    """What moves with a mirror, its vehicle, is not in the mirror's own map where the box around both has at most so many
     times the diagonal of the mirror's; 0: it is shown."""
     local_keep_px: float = 0.0
     """A moving mirror's local map is kept while what it holds has shifted by less than this in the mean; 0: never. [texels]"""

@@ -2,7 +2,7 @@
 
 Source: Blinn and Newell, Texture and Reflection in Computer Generated Images, CACM 1976; as a cube, Greene, Environment
 Mapping and Other Applications of World Projections, IEEE CG&A 1986. Exact for what is infinitely far; how far off it is
-elsewhere, `parallax_px` predicts. The mirror itself is left out of its map.
+elsewhere, `parallax_px` predicts. The mirror itself is left out of its map, and the vehicle that it moves with.
 
 Mirrors seen in the map show the domes (`bounces` 1), their own maps to a fixed depth, or their maps of the previous frame
 (`environment_update` "previous"), see `mirror_maps.py`.
@@ -63,19 +63,44 @@ def centre_of(scene: Scene, part: int) -> np.ndarray:
     return 0.5 * (points.min(axis=0) + points.max(axis=0)) + scene.origin
 
 
-def left_out(scene: Scene, part: int) -> tuple[int, ...]:
-    """The parts that a mirror does not show: itself, and what its collection does not name."""
-    seen = scene.seen_in(scene.parts[part])
-    others = (
-        ()
-        if seen is None
-        else (
-            k
-            for k, other in enumerate(scene.parts)
-            if k != part and other.triangle_count and not seen[other.first_triangle]
-        )
-    )
-    return (part, *others)
+def left_out(scene: Scene, part: int, settings: Settings) -> tuple[int, ...]:
+    """The parts that a mirror's map does not show: itself, its vehicle, and what its collection does not name."""
+    seen, own = scene.seen_in(scene.parts[part]), (part, *vehicle_of(scene, part, settings))
+    if seen is None:
+        return own
+    solid = [k for k, other in enumerate(scene.parts) if other.triangle_count and k not in own]
+    return *own, *(k for k in solid if not seen[scene.parts[k].first_triangle])
+
+
+def vehicle_of(scene: Scene, part: int, settings: Settings) -> tuple[int, ...]:
+    """What moves with a mirror and is about as large: a map's eye is amid it, where it would hide what the mirror shows.
+
+    Meyer and Loscos leave a car out of its own map. A small mirror on a large vehicle, whose eye is not within it, shows it;
+    what stands still is no vehicle, since it is not known what would move together.
+
+    Args:
+        scene: Its instances name what they move by.
+        part: The mirror, index into `scene.parts`.
+        settings: `local_own_size`.
+
+    Returns:
+        The parts, without the mirror; none where it does not move.
+    """
+    instances, own = scene.data.instances, scene.parts[part]
+    by, copy = instances[own.prim - 1].mover, own.instance
+    if not by or settings.local_own_size == 0.0:
+        return ()
+    with_it = [
+        k
+        for k in scene.moving_parts
+        if scene.parts[k].instance == copy
+        and scene.parts[k].triangle_count
+        and f"{instances[scene.parts[k].prim - 1].mover}/".startswith(f"{by}/")
+    ]
+    first, _, boxes = scene.boxes
+    rows = np.searchsorted(first, [own.first_vertex, *(scene.parts[k].first_vertex for k in with_it)])
+    alone, together = (np.linalg.norm(np.ptp(boxes[each].reshape(-1, 3), axis=0)) for each in (rows[:1], rows))
+    return tuple(k for k in with_it if k != part) if together <= settings.local_own_size * alone else ()
 
 
 def prepare(scene: Scene, reflector, settings: Settings) -> Prepared:
@@ -121,7 +146,9 @@ def _draw(scene: Scene, part: int, centre: np.ndarray, settings: Settings, befor
     resolution = settings.environment_resolution
     options = {"shadows": asked_shadows(scene, settings), "threads": settings.threads, "kernels": settings.kernels}
     onward = onward_of(scene, part, settings, before)
-    return render_maps(scene, centre[None], resolution, without=[left_out(scene, part)], onward=onward, **options), 0
+    return render_maps(
+        scene, centre[None], resolution, without=[left_out(scene, part, settings)], onward=onward, **options
+    ), 0
 
 
 def onward_of(scene: Scene, part: int, settings: Settings, before: dict[int, Shown] | None = None) -> Onward | None:
@@ -137,7 +164,7 @@ def onward_of(scene: Scene, part: int, settings: Settings, before: dict[int, Sho
         from warp_reflect.techniques import mirror_maps
 
         return mirror_maps.of_previous_frame(scene, before)
-    gone = left_out(scene, part)
+    gone = left_out(scene, part, settings)
     others = (k for k, other in enumerate(scene.parts) if k not in gone and other.triangle_count)
     if settings.bounces <= 1 or not any(mirror_weight(scene, scene.parts[k], settings) for k in others):
         return None

@@ -25,9 +25,9 @@ from warp_reflect.settings import Settings, Status, Technique
 from warp_reflect.shade import LightView
 from warp_reflect.shapes import TriangleHit, clamp_weights, intersect_triangle, unit
 from warp_reflect.techniques import local_map, local_mesh, local_movers, reference_maps
-from warp_reflect.techniques.environment import Shown, centre_of, onward_of
+from warp_reflect.techniques.environment import Shown, centre_of, onward_of, vehicle_of
 from warp_reflect.techniques.local_mesh import DepthMesh
-from warp_reflect.techniques.local_movers import moving_in, vehicle_of
+from warp_reflect.techniques.local_movers import moving_in
 from warp_reflect.techniques.reference_maps import ReferenceMaps
 
 wp.set_module_options({"enable_backward": False})

@@ -21,6 +21,7 @@ from warp_reflect.launch import FINITE_FLAGS
 from warp_reflect.scene import Scene
 from warp_reflect.settings import Settings
 from warp_reflect.techniques import local_map
+from warp_reflect.techniques.environment import vehicle_of
 
 # Directions and centres are finite: those of texels, and of bodies.
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FINITE_FLAGS})
@@ -86,37 +87,6 @@ def moving_in(scene: Scene, part: int, settings: Settings) -> tuple[int, ...]:
         for k in scene.moving_parts
         if k not in own and scene.parts[k].triangle_count and (seen is None or seen[scene.parts[k].first_triangle])
     )
-
-
-def vehicle_of(scene: Scene, part: int, settings: Settings) -> tuple[int, ...]:
-    """What moves with a mirror and is about as large: a map's eye is amid it, where it would hide what the mirror shows.
-
-    Meyer and Loscos leave a car out of its own map. A small mirror on a large vehicle, whose eye is not within it, shows it;
-    what stands still is no vehicle, since it is not known what would move together.
-
-    Args:
-        scene: Its instances name what they move by.
-        part: The mirror, index into `scene.parts`.
-        settings: `local_own_size`.
-
-    Returns:
-        The parts, without the mirror; none where it does not move.
-    """
-    instances, own = scene.data.instances, scene.parts[part]
-    by, copy = instances[own.prim - 1].mover, own.instance
-    if not by or settings.local_own_size == 0.0:
-        return ()
-    with_it = [
-        k
-        for k in scene.moving_parts
-        if scene.parts[k].instance == copy
-        and scene.parts[k].triangle_count
-        and f"{instances[scene.parts[k].prim - 1].mover}/".startswith(f"{by}/")
-    ]
-    first, _, boxes = scene.boxes
-    rows = np.searchsorted(first, [own.first_vertex, *(scene.parts[k].first_vertex for k in with_it)])
-    alone, together = (np.linalg.norm(np.ptp(boxes[each].reshape(-1, 3), axis=0)) for each in (rows[:1], rows))
-    return tuple(k for k in with_it if k != part) if together <= settings.local_own_size * alone else ()
 
 
 @wp.func

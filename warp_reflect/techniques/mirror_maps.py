@@ -74,7 +74,7 @@ def of_depth(scene: Scene, settings: Settings, depth: int) -> Onward:
 
     resolution, shadows = settings.environment_resolution, asked_shadows(scene, settings)
     parts = tuple(k for k, part in enumerate(scene.parts) if mirror_weight(scene, part, settings))
-    key = ("mirrors", parts, resolution, shadows, depth)
+    key = ("mirrors", parts, resolution, shadows, settings.local_own_size, depth)
     if key not in scene.environments:
         deeper = of_depth(scene, settings, depth - 1) if depth > 1 else None
         centres = np.array([centre_of(scene, part) for part in parts]).reshape(-1, 3)
@@ -82,7 +82,7 @@ def of_depth(scene: Scene, settings: Settings, depth: int) -> Onward:
             scene,
             centres,
             resolution,
-            without=[left_out(scene, part) for part in parts],
+            without=[left_out(scene, part, settings) for part in parts],
             onward=deeper,
             shadows=shadows,
             threads=settings.threads,
