@@ -36,8 +36,9 @@ def target_of(width, height, rays=None, mask=None):
     return target
 
 
-def drawn(kernels, screen, triangles, width, height, rays=None, mask=None, points=None, threads=1):
+def drawn(kernels, screen, triangles, width, height, rays=None, mask=None, points=None, threads=1, painter=0, **named):
     target = target_of(width, height, rays, mask)
+    target.view.painter = painter
     rasterise(
         target,
         wp.array(screen, dtype=wp.vec4, device=CPU),
@@ -45,6 +46,7 @@ def drawn(kernels, screen, triangles, width, height, rays=None, mask=None, point
         points=None if points is None else wp.array(points, dtype=wp.vec3, device=CPU),
         threads=threads,
         kernels=kernels,
+        **named,
     )
     return target.key.numpy()
 
@@ -92,11 +94,7 @@ def test_masks_and_rays_are_honoured_bit_for_bit(kind, with_rays):
     mask = (rng.random((height, width)) < 0.7).astype(np.int32)
     rays = points = None
     if with_rays:
-        turned = rng.normal(size=(height * width, 3))
-        turned /= np.linalg.norm(turned, axis=1, keepdims=True)
-        ray = np.zeros((height * width, 2, 4), np.float32)
-        ray[:, 0, :3], ray[:, 0, 3] = rng.normal(size=(height * width, 3)), rng.uniform(1, 3, height * width)
-        ray[:, 1, :3], ray[:, 1, 3] = turned, rng.uniform(1.0, 1.5, height * width)
+        ray = rays_of(rng, height * width)
         ray[mask.reshape(-1) == 0] = 0.0
         rays = ray.reshape(-1, 4)
         points = rng.normal(size=(3 * count, 3)).astype(np.float32) * 3.0
@@ -104,6 +102,46 @@ def test_masks_and_rays_are_honoured_bit_for_bit(kind, with_rays):
     plain = drawn("plain", *args)
     assert (plain > 0).any() and not plain.reshape(height, width)[mask == 0].any()
     np.testing.assert_array_equal(drawn("vector", *args), plain)
+
+
+def rays_of(rng, count):
+    """What `raster.attach_rays` gives the cells of a target, float32 [2 * count, 4]."""
+    turned = rng.normal(size=(count, 3))
+    turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+    ray = np.zeros((count, 2, 4), np.float32)
+    ray[:, 0, :3], ray[:, 0, 3] = rng.normal(size=(count, 3)), rng.uniform(1, 3, count)
+    ray[:, 1, :3], ray[:, 1, 3] = turned, rng.uniform(1.0, 1.5, count)
+    return ray
+
+
+@pytest.mark.parametrize("painter", [0, 1])
+@pytest.mark.parametrize("with_rays", [False, True])
+def test_blocks_of_triangles_of_every_kind_are_drawn_bit_for_bit(with_rays, painter):
+    """Small, large and clipped ones, some without area or off the picture, side by side in blocks that are not full."""
+    rng = np.random.default_rng(8)
+    width, height, each = 173, 91, 1100
+    kinds = ("tiny", "small", "edge", "large")
+    screen = np.concatenate([corners_of(kind, rng, each, width, height) for kind in kinds]).reshape(-1, 3, 4)
+    clipped = rng.choice(len(screen), 60, replace=False)
+    screen[clipped[:20], 0, :2] *= 1.0e5
+    screen[clipped[20:40], 1] = rng.normal(size=(20, 4)) * (40.0, 40.0, 0.0, 1.0)  # in front of the near plane
+    screen[clipped[40:], 2] = screen[clipped[40:], 1]
+    screen = screen[rng.permutation(len(screen))].reshape(-1, 4)
+    count = len(screen) // 3
+    triangles = np.arange(3 * count, dtype=np.int32).reshape(-1, 3)
+    given = {"painter": painter, "id_offset": 7}
+    if with_rays:
+        given["rays"] = rays_of(rng, width * height).reshape(-1, 4)
+        # Planes of triangles of every size, down to where their edges' product leaves float32's safe range.
+        scale = 10.0 ** rng.uniform(-14.0, 10.0, (count, 1, 1))
+        given["points"] = (rng.normal(size=(count, 3, 3)) * scale).reshape(-1, 3).astype(np.float32)
+        given["plane_triangles"] = wp.array(triangles[:, [2, 0, 1]], dtype=wp.vec3i, device=CPU)
+        given["ids"] = wp.array(rng.permutation(count).astype(np.int32), dtype=int, device=CPU)
+    plain = drawn("plain", screen, triangles, width, height, **given)
+    assert (plain > 0).mean() > 0.9
+    for threads in (1, 2, 5):
+        again = drawn("vector", screen, triangles, width, height, threads=threads, **given)
+        np.testing.assert_array_equal(again, plain)
 
 
 def test_what_cannot_be_drawn_is_the_same_nothing():

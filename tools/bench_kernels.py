@@ -25,7 +25,7 @@ from bench_frames import commit, machine, wavefront
 
 # Loop: kernels of either kind. The plain search runs after the vector one, for what that leaves.
 LOOPS = {
-    "rasterise, eye and virtual": ("draw_kernel", "draw_lanes_kernel"),
+    "rasterise, eye and virtual": ("draw_kernel", "draw_blocks_kernel"),
     "meet the mirror": ("mirror_pixels_kernel", "mirror_blocks_kernel"),
     "search reflection points": ("search_kernel", "search_blocks_kernel"),
     "step from a grid's directions": ("direction_kernel", "direction_lanes_kernel"),

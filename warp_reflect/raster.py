@@ -565,7 +565,9 @@ def rasterise(
     if vector.chosen(kernels, device):
         from warp_reflect import raster_vector  # which draws with this module's functions
 
-        kernel = raster_vector.draw_lanes_kernel
+        kernel = raster_vector.draw_blocks_kernel
+        # Every slice but the last, which is the only one where there is one, is a multiple of the block.
+        ranges = [(begin // vector.BLOCK, vector.block_count(n)) for begin, n in ranges]
     launch_bands(kernel, ranges, bands, inputs, device)
     return int(counts.sum())
 

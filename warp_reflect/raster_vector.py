@@ -1,4 +1,9 @@
-"""`raster.draw_kernel` with pixels of a row side by side: the same picture, bit for bit.
+"""`raster.draw_kernel` with triangles and pixels side by side: the same picture, bit for bit.
+
+Triangles are set up in vectors, those within a box of 64 pixels are scanned row by row, and what several of them cover is
+gathered in one list: its vectors are full however few pixels a triangle has, and what a fragment needs of memory has been
+asked for by the time it is worked on. Larger triangles are drawn one at a time with pixels of a row side by side; what has to
+be clipped, by the plain kernel's functions.
 
 Edge functions of a triangle within a box of 64 pixels are exact in 32 bits (products below 2^29, sums of two below 2^30, and a
 vector reaches at most 16 pixels past the box); of larger ones in float64, whose 53 bits hold everything below 2^46.
@@ -10,6 +15,7 @@ import warp as wp
 
 from warp_reflect import vector
 from warp_reflect.raster import (
+    GUARD,
     RAY_ALONG_MIN,
     RAY_TRUST,
     PlaneView,
@@ -22,19 +28,300 @@ from warp_reflect.raster import (
 
 wp.set_module_options({"enable_backward": False})
 
+BLOCK = wp.constant(vector.BLOCK)
+
+# What both snippets begin with.
+_TARGET = r"""
+    typedef long long S __attribute__((ext_vector_type(LANES)));
+    auto snap = [](F x) -> I { return __builtin_convertvector(__builtin_elementwise_floor(x * 256.0f + 0.5f), I); };
+    // raster.edge_bias
+    auto edge_bias = [](I dx, I dy) -> I { return ((dy < 0) | ((dy == 0) & (dx > 0))) ? I(0) : I(-1); };
+    const int width = target.x1 - target.x0;
+    const bool rays = target.ray.shape[0] > 0;
+    // A masked target with rays has none outside its mask.
+    const bool masked = target.mask_value > 0 && !rays;
+    const float* ray_of = (const float*)target.ray.data;
+    unsigned long long* keys = (unsigned long long*)target.key.data;
+    const F key_min = F(target.key_min);
+
+    // Fragments of interpolated keys at cells, of triangles with these planes and, by owner, complements of their numbers;
+    // raster.ray_key where there are rays.
+    auto put = [&](I inside, I cell, F depth, V n, F offset, I owner, const int* low_of) {
+        inside &= depth > key_min;
+        F now;
+        EACH_LANE now[l] = __builtin_bit_cast(float, (unsigned)(keys[cell[l]] >> 32));
+        if (rays) {
+            F ray[8];
+            gather8(ray_of, 8 * cell, ray);
+            const V o = V{ray[0], ray[1], ray[2]}, d = V{ray[4], ray[5], ray[6]};
+            const F o_w = ray[3], d_w = ray[7];
+            const F path = d_w / depth;
+            const F along = n.x * d.x + n.y * d.y + n.z * d.z;
+            const F height = offset - n.x * o.x - n.y * o.y - n.z * o.z;
+            const F linear = path - o_w;
+            const F t = height / along;
+            const I trusted = (__builtin_elementwise_abs(along) > ray_along_min)
+                & (__builtin_elementwise_abs(t - linear) < ray_trust * path);
+            const F total = o_w + pick(trusted, fmax(t, F(0.0f)), linear);
+            depth = 1.0f / fmax(total, F(1.0e-30f));
+            inside &= d_w > 0.0f;
+        }
+        float depths[LANES];
+        int cells[LANES], owners[LANES];
+        store(depths, depth);
+        istore(cells, cell);
+        istore(owners, owner);
+        for (unsigned left = bits(inside & (depth >= now)); left != 0; left &= left - 1) {
+            const int l = __builtin_ctz(left);
+            const unsigned high = __builtin_bit_cast(unsigned, depths[l]);
+            const unsigned long long key = ((unsigned long long)high << 32) | (unsigned)low_of[owners[l]];
+            if (key > keys[cells[l]]) keys[cells[l]] = key;
+        }
+    };
+"""
+
 
 @wp.func_native(
-    vector.snippet(r"""
+    vector.snippet(
+        _TARGET
+        + r"""
+    constexpr int LISTED = 256;  // fragments that are worked on together
+    constexpr int ROWS_MAX = 66;  // of a box of 64 pixels, and one to read past
+    constexpr int LIST_MAX = LISTED + ROWS_MAX * LANES;
+    auto marks = [&](I mask) -> unsigned {
+#if defined(__AVX__) && !defined(__AVX512F__)
+        return __builtin_ia32_movmskps256(__builtin_bit_cast(F, mask));
+#else
+        return bits(mask);
+#endif
+    };
+    auto least = [](I p, I q) -> I { return p < q ? p : q; };
+    auto most = [](I p, I q) -> I { return p > q ? p : q; };
+    auto apart = [](V a, F s) -> V { return V{a.x / s, a.y / s, a.z / s}; };
+    const int* corner_of = (const int*)triangles.data;
+    const int* plane_corner_of = (const int*)plane_triangles.data;
+    const int* numbers = survivors.data + begin;
+    const float* point_of = (const float*)points.data;
+    const float* screen_of = (const float*)screen.data;
+    const int row0 = target.y0 > row_first ? target.y0 : row_first;
+    const int row1 = target.y1 < row_end ? target.y1 : row_end;
+
+    // Of a triangle: its plane, and the complement of its number.
+    float plane_of[BLOCK * 8];
+    int low_of[BLOCK];
+    int cells[LIST_MAX], owners[LIST_MAX];
+    float depths[LIST_MAX];
+    int listed = 0;
+    auto flush = [&]() {
+        for (int start = 0; start < listed; start += LANES) {
+            const I valid = start + lanes() < listed;
+            const I cell = ipick(valid, iload(cells + start), I(cells[start]));
+            const I owner = ipick(valid, iload(owners + start), I(owners[start]));
+            I inside = valid;
+            if (masked) {
+                const I row = cell / width;
+                const I at = (target.y0 + row) * target.mask_width + target.x0 + cell - row * width;
+                inside &= igather(target.mask.data, at) == target.mask_value;
+            }
+            V n = same(0.0f);
+            F offset = F(0.0f);
+            if (rays) {
+                F plane[8];
+                gather8(plane_of, 8 * owner, plane);
+                n = V{plane[0], plane[1], plane[2]};
+                offset = plane[3];
+            }
+            put(inside, cell, load(depths + start), n, offset, owner, low_of);
+        }
+        listed = 0;
+    };
+
+    unsigned long long others = 0;
+    for (int start = 0; start < count; start += LANES) {
+        const I valid = start + lanes() < count;
+        const I t = igather(numbers, ipick(valid, start + lanes(), I(start)));
+        I corner[3];
+        F x[3], y[3], k[3];
+        _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each) {
+            corner[each] = igather(corner_of, 3 * t + each);
+            EACH_LANE {
+                const float* v = screen_of + 4 * corner[each][l];
+                x[each][l] = v[0]; y[each][l] = v[1]; k[each][l] = v[2];
+            }
+        }
+        if (target.painter != 0) {
+            const F middle = (k[0] + k[1] + k[2]) / 3.0f;
+            _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each)
+                k[each] = pick(k[each] > 0.0f, middle, k[each]);
+        }
+        I clipped = I(0);
+        _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each)
+            clipped |= (k[each] == 0.0f) | (__builtin_elementwise_abs(x[each]) > guard)
+                | (__builtin_elementwise_abs(y[each]) > guard);
+        // What is no finite number snaps to no pixel.
+        const I finite = (x[0] + x[1] + x[2] + y[0] + y[1] + y[2] + k[0] + k[1] + k[2]) * 0.0f == 0.0f;
+        const I sound = valid & finite & ~clipped;
+        I sx[3], sy[3];
+        _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each) {
+            sx[each] = snap(pick(sound, x[each], F(0.0f)));
+            sy[each] = snap(pick(sound, y[each], F(0.0f)));
+        }
+        const I low_x = least(sx[0], least(sx[1], sx[2])), high_x = most(sx[0], most(sx[1], sx[2]));
+        const I low_y = least(sy[0], least(sy[1], sy[2])), high_y = most(sy[0], most(sy[1], sy[2]));
+        const I left = most((low_x + 127) >> 8, I(target.x0)), right = least((high_x - 128) >> 8, I(target.x1 - 1));
+        const I top = most((low_y + 127) >> 8, I(row0)), bottom = least((high_y - 128) >> 8, I(row1 - 1));
+        const I seen = sound & (left <= right) & (top <= bottom);
+        const I small = (high_x - low_x <= 64 * 256) & (high_y - low_y <= 64 * 256);
+        others |= (unsigned long long)bits((valid & clipped) | (seen & ~small)) << start;
+        I drawn = seen & small;
+        if (!bits(drawn)) continue;
+        // Of what is not drawn here products would not fit.
+        const I xa = ipick(drawn, sx[0], I(0)), ya = ipick(drawn, sy[0], I(0));
+        I xb = ipick(drawn, sx[1], I(0)), yb = ipick(drawn, sy[1], I(0));
+        I xc = ipick(drawn, sx[2], I(0)), yc = ipick(drawn, sy[2], I(0));
+        I area = (xb - xa) * (yc - ya) - (yb - ya) * (xc - xa);
+        drawn &= area != 0;
+        const I turned = area < 0;
+        area = ipick(turned, -area, area);
+        const I x_b = xb, y_b = yb;
+        xb = ipick(turned, xc, xb); yb = ipick(turned, yc, yb);
+        xc = ipick(turned, x_b, xc); yc = ipick(turned, y_b, yc);
+        const F kb = pick(turned, k[2], k[1]), kc = pick(turned, k[1], k[2]);
+        const I dxa = xc - xb, dya = yc - yb, dxb = xa - xc, dyb = ya - yc, dxc = xb - xa, dyc = yb - ya;
+        const I px = ipick(drawn, left * 256 + 128, I(0)), py = ipick(drawn, top * 256 + 128, I(0));
+        const F inv_area = 1.0f / __builtin_convertvector(area, F);
+        // Of every triangle: edges at the first pixel, the largest that is outside, steps, and what is left of it.
+        enum { EA, EB, EC, OUT_A, OUT_B, OUT_C, DXA, DXB, DXC, DYA, DYB, DYC, COLUMNS, ROWS, CELL, FIELDS };
+        int field[FIELDS][LANES];
+        istore(field[EA], dxa * (py - yb) - dya * (px - xb));
+        istore(field[EB], dxb * (py - yc) - dyb * (px - xc));
+        istore(field[EC], dxc * (py - ya) - dyc * (px - xa));
+        istore(field[OUT_A], -1 - edge_bias(dxa, dya));
+        istore(field[OUT_B], -1 - edge_bias(dxb, dyb));
+        istore(field[OUT_C], -1 - edge_bias(dxc, dyc));
+        istore(field[DXA], dxa * 256);
+        istore(field[DXB], dxb * 256);
+        istore(field[DXC], dxc * 256);
+        istore(field[DYA], dya * 256);
+        istore(field[DYB], dyb * 256);
+        istore(field[DYC], dyc * 256);
+        istore(field[COLUMNS], right - left);
+        istore(field[ROWS], bottom - top);
+        istore(field[CELL], (top - target.y0) * width + left - target.x0);
+        float keys_a[LANES], keys_b[LANES], keys_c[LANES], inverse[LANES];
+        store(keys_a, k[0]);
+        store(keys_b, kb);
+        store(keys_c, kc);
+        store(inverse, inv_area);
+        istore(low_of + start, ~(ids.shape[0] > 0 ? igather(ids.data, t) : t + id_offset));
+        if (rays) {
+            // raster.triangle_plane
+            V p[3];
+            _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each)
+                p[each] = vgather(point_of, igather(plane_corner_of, 3 * t + each));
+            V n = cross(sub(p[1], p[0]), sub(p[2], p[0]));
+            const F square = dot(n, n);
+            const I safe = (square > 1.0e-24f) & (square < 1.0e24f);
+            V plane = times(1.0f / __builtin_elementwise_sqrt(square), n);
+            if (bits(~safe)) {
+                const V s = apart(n, size(n));
+                plane = vpick(safe, plane, vpick(size(n) == 0.0f, same(0.0f), apart(s, __builtin_elementwise_sqrt(dot(s, s)))));
+            }
+            const F offset = dot(plane, p[0]);
+            EACH_LANE {
+                float* to = plane_of + 8 * (start + l);
+                to[0] = plane.x[l]; to[1] = plane.y[l]; to[2] = plane.z[l]; to[3] = offset[l];
+            }
+        }
+        for (unsigned left_over = bits(drawn); left_over != 0; left_over &= left_over - 1) {
+            const int l = __builtin_ctz(left_over);
+            const int owner = start + l, columns = field[COLUMNS][l], rows = field[ROWS][l];
+            const I step_a = I(field[DYA][l]), step_b = I(field[DYB][l]), step_c = I(field[DYC][l]);
+            const I row_a = I(field[DXA][l]), row_b = I(field[DXB][l]), row_c = I(field[DXC][l]);
+            const I out_a = I(field[OUT_A][l]), out_b = I(field[OUT_B][l]), out_c = I(field[OUT_C][l]);
+            const F key_a = F(keys_a[l]), key_b = F(keys_b[l]), key_c = F(keys_c[l]), inv = F(inverse[l]);
+            for (int x = 0; x <= columns; x += LANES) {
+                const I column = x + lanes();
+                const I within = column <= columns;
+                I ea = field[EA][l] - column * step_a, eb = field[EB][l] - column * step_b, ec = field[EC][l] - column * step_c;
+                // Depth and coverage of the rows' pixels.
+                float row_depth[ROWS_MAX][LANES];
+                unsigned covered[ROWS_MAX];
+                for (int y = 0; y <= rows; ++y) {
+                    const I inside = (ea > out_a) & (eb > out_b) & (ec > out_c) & within;
+                    const F depth = (__builtin_convertvector(ea, F) * key_a + __builtin_convertvector(eb, F) * key_b
+                        + __builtin_convertvector(ec, F) * key_c) * inv;
+                    store(row_depth[y], depth);
+                    covered[y] = marks(inside);
+                    ea += row_a;
+                    eb += row_b;
+                    ec += row_c;
+                }
+                // A triangle covers one run of a row: whole vectors from its first pixel on, one over the end of the other.
+                for (int y = 0; y <= rows; ++y) {
+                    const int skipped = __builtin_ctz(covered[y] | 1u << LANES), length = __builtin_popcount(covered[y]);
+                    const int cell = field[CELL][l] + y * width + x + skipped;
+                    istore(cells + listed, cell + lanes());
+                    istore(owners + listed, I(owner));
+                    store(depths + listed, load(row_depth[y] + skipped));
+                    __builtin_prefetch(keys + cell);
+                    if (rays) {
+                        __builtin_prefetch(ray_of + 8 * cell);
+                        __builtin_prefetch(ray_of + 8 * (cell + length - 1));
+                    }
+                    listed += length;
+                }
+                if (listed >= LISTED) flush();
+            }
+        }
+    }
+    flush();
+    return others;
+""",
+        "return 0;",
+    )
+)
+def draw_block(
+    target: TargetView,
+    screen: wp.array(dtype=wp.vec4),
+    triangles: wp.array(dtype=wp.vec3i),
+    ids: wp.array(dtype=int),
+    id_offset: int,
+    survivors: wp.array(dtype=int),
+    begin: int,
+    count: int,
+    points: wp.array(dtype=wp.vec3),
+    plane_triangles: wp.array(dtype=wp.vec3i),
+    row_first: int,
+    row_end: int,
+    guard: float,
+    ray_along_min: float,
+    ray_trust: float,
+) -> wp.uint64:
+    """Draw those of `count` survivors that are small; a bit for each of the others."""
+    ...
+
+
+@wp.func_native(
+    vector.snippet(
+        _TARGET
+        + r"""
     typedef double D __attribute__((ext_vector_type(LANES)));
-    typedef long long S __attribute__((ext_vector_type(LANES)));
-    auto snap = [](float x) -> int { return (int)__builtin_floorf(x * 256.0f + 0.5f); };
     auto least = [](int p, int q) -> int { return p < q ? p : q; };
     auto most = [](int p, int q) -> int { return p > q ? p : q; };
-    // What is no finite number snaps to no pixel.
-    const float none = (a[0] + a[1] + a[2] + b[0] + b[1] + b[2] + c[0] + c[1] + c[2]) * 0.0f;
-    if (!(none == 0.0f)) return;
-    const int xa = snap(a[0]), ya = snap(a[1]);
-    int xb = snap(b[0]), yb = snap(b[1]), xc = snap(c[0]), yc = snap(c[1]);
+    // The same of LANES cells of a row, without rays and mask: without a branch, and without a masked store, which is slow.
+    auto put_row = [&](I inside, int cell, F depth, unsigned low) {
+        inside &= depth > key_min;
+        // Positive keys order as signed words too.
+        S now;
+        __builtin_memcpy(&now, keys + cell, sizeof(now));
+        const S key = (__builtin_convertvector(__builtin_bit_cast(U, depth), S) << 32) | (long long)low;
+        const S kept = __builtin_convertvector(inside, S) & (key > now);
+        now ^= (now ^ key) & kept;
+        __builtin_memcpy(keys + cell, &now, sizeof(now));
+    };
+    const int xa = snap(F(a[0]))[0], ya = snap(F(a[1]))[0];
+    int xb = snap(F(b[0]))[0], yb = snap(F(b[1]))[0], xc = snap(F(c[0]))[0], yc = snap(F(c[1]))[0];
     const float ka = a[2];
     float kb = b[2], kc = c[2];
     long long area = (long long)(xb - xa) * (yc - ya) - (long long)(yb - ya) * (xc - xa);
@@ -57,132 +344,12 @@ wp.set_module_options({"enable_backward": False})
     const long long ea0 = (long long)dxa * (py - yb) - (long long)dya * (px - xb);
     const long long eb0 = (long long)dxb * (py - yc) - (long long)dyb * (px - xc);
     const long long ec0 = (long long)dxc * (py - ya) - (long long)dyc * (px - xa);
-    // raster.edge_bias
-    const int bias_a = dya < 0 || (dya == 0 && dxa > 0) ? 0 : -1;
-    const int bias_b = dyb < 0 || (dyb == 0 && dxb > 0) ? 0 : -1;
-    const int bias_c = dyc < 0 || (dyc == 0 && dxc > 0) ? 0 : -1;
+    const double bias_a = edge_bias(I(dxa), I(dya))[0], bias_b = edge_bias(I(dxb), I(dyb))[0];
+    const double bias_c = edge_bias(I(dxc), I(dyc))[0];
     const float inv_area = 1.0f / (float)area;
-    const int width = target.x1 - target.x0;
-    const bool rays = target.ray.shape[0] > 0;
-    // A masked target with rays has none outside its mask.
-    const bool masked = target.mask_value > 0 && !rays;
-    const float* ray_of = (const float*)target.ray.data;
-    unsigned long long* keys = (unsigned long long*)target.key.data;
-    const unsigned low_word = ~(unsigned)triangle;
-    const F key_min = F(target.key_min);
-
-    auto put = [&](int cell, float key) {
-        const unsigned high = __builtin_bit_cast(unsigned, key);
-        const unsigned long long packed = ((unsigned long long)high << 32) | low_word;
-        if (packed > keys[cell]) keys[cell] = packed;
-    };
-    // Fragments of interpolated keys at cells; raster.ray_key where there are rays.
-    auto put_all = [&](I inside, I cell, F depth) {
-        inside &= depth > key_min;
-        F now;
-        EACH_LANE now[l] = __builtin_bit_cast(float, (unsigned)(keys[cell[l]] >> 32));
-        if (rays) {
-            F ray[8];
-            gather8(ray_of, 8 * cell, ray);
-            const V o = V{ray[0], ray[1], ray[2]}, d = V{ray[4], ray[5], ray[6]};
-            const F o_w = ray[3], d_w = ray[7];
-            const F path = d_w / depth;
-            const F along = plane.n[0] * d.x + plane.n[1] * d.y + plane.n[2] * d.z;
-            const F height = plane.offset - plane.n[0] * o.x - plane.n[1] * o.y - plane.n[2] * o.z;
-            const F linear = path - o_w;
-            const F t = height / along;
-            const I trusted = (__builtin_elementwise_abs(along) > ray_along_min)
-                & (__builtin_elementwise_abs(t - linear) < ray_trust * path);
-            const F total = o_w + pick(trusted, fmax(t, F(0.0f)), linear);
-            depth = 1.0f / fmax(total, F(1.0e-30f));
-            inside &= d_w > 0.0f;
-        }
-        float depths[LANES];
-        int cells[LANES];
-        store(depths, depth);
-        istore(cells, cell);
-        for (unsigned left_bits = bits(inside & (depth >= now)); left_bits != 0; left_bits &= left_bits - 1) {
-            const int l = __builtin_ctz(left_bits);
-            put(cells[l], depths[l]);
-        }
-    };
-
-    if (high_x - low_x <= 64 * 256 && high_y - low_y <= 64 * 256) {
-        // The run of covered pixels of every row, rows side by side: an edge is crossed at a quotient of whole numbers below
-        // 2^31 and 2^22, which float64 tells from its neighbours with `slack` to spare.
-        int run_first[64 + LANES], run_length[64 + LANES];
-        const double slack = 1.0 / (1 << 24);
-        const int rows = bottom - top + 1;
-        const I last = I(right - left);
-        for (int start = 0; start < rows; start += LANES) {
-            const I row = start + lanes();
-            I first = I(0), end = last;
-            auto cut = [&](int e0, int bias, int dx, int dy) {
-                const I e = e0 + bias + row * (dx * 256);
-                if (dy == 0) {
-                    end = ipick(e >= 0, end, I(-1));
-                    return;
-                }
-                const D crossing = __builtin_convertvector(e, D) * (1.0 / (dy * 256.0));
-                if (dy > 0) {
-                    const I at = __builtin_convertvector(__builtin_elementwise_floor(crossing + slack), I);
-                    end = at < end ? at : end;
-                } else {
-                    const I at = __builtin_convertvector(__builtin_elementwise_ceil(crossing - slack), I);
-                    first = at > first ? at : first;
-                }
-            };
-            cut((int)ea0, bias_a, dxa, dya);
-            cut((int)eb0, bias_b, dxb, dyb);
-            cut((int)ec0, bias_c, dxc, dyc);
-            const I length = end - first + 1;
-            istore(run_first + start, first);
-            istore(run_length + start, length > 0 ? length : I(0));
-        }
-        const int xstep_a = dya * 256, xstep_b = dyb * 256, xstep_c = dyc * 256;
-        const int ystep_a = dxa * 256, ystep_b = dxb * 256, ystep_c = dxc * 256;
-        const int cell0 = (top - target.y0) * width + left - target.x0;
-        // Covered pixels of the triangle, one after the other, as (row << 8) | column.
-        int list[16 * LANES + 64 + LANES];
-        int listed = 0;
-        auto flush = [&](int whole) {
-            for (int start = 0; start < whole; start += LANES) {
-                const I valid = start + lanes() < listed;
-                const I code = ipick(valid, iload(list + start), I(list[start]));
-                const I y = code >> 8, x = code & 255;
-                const I ea = (int)ea0 + y * ystep_a - x * xstep_a;
-                const I eb = (int)eb0 + y * ystep_b - x * xstep_b;
-                const I ec = (int)ec0 + y * ystep_c - x * xstep_c;
-                const F depth = (__builtin_convertvector(ea, F) * ka + __builtin_convertvector(eb, F) * kb
-                    + __builtin_convertvector(ec, F) * kc) * inv_area;
-                I inside = valid;
-                if (masked) {
-                    I mask;
-                    const I at = (top + y) * target.mask_width + left + x;
-                    EACH_LANE mask[l] = target.mask.data[at[l]];
-                    inside &= mask == target.mask_value;
-                }
-                put_all(inside, cell0 + y * width + x, depth);
-            }
-        };
-        for (int row = 0; row < rows; ++row) {
-            const int length = run_length[row];
-            const I code = (row << 8) + run_first[row] + lanes();
-            istore(list + listed, code);
-            for (int x = LANES; x < length; x += LANES) istore(list + listed + x, code + x);
-            listed += length;
-            if (listed >= 16 * LANES) {
-                flush(16 * LANES);
-                const int rest = listed - 16 * LANES;
-                for (int x = 0; x < rest; ++x) list[x] = list[16 * LANES + x];
-                listed = rest;
-            }
-        }
-        flush(listed);
-        return;
-    }
-
-    // Large triangles: LANES pixels of a row at a time.
+    const V n = spread(plane.n);
+    const F offset = F(plane.offset);
+    const int low = ~triangle;
     typedef decltype(D() < D()) Wide;
     const D lane = __builtin_convertvector(lanes(), D);
     const double xstep_a = dya * 256.0, xstep_b = dyb * 256.0, xstep_c = dyc * 256.0;
@@ -192,30 +359,18 @@ wp.set_module_options({"enable_backward": False})
         D ea = ea_row, eb = eb_row, ec = ec_row;
         const int cell = (y - target.y0) * width - target.x0;
         for (int x = left; x <= right; x += LANES) {
-            const Wide within = (ea + (double)bias_a >= 0.0) & (eb + (double)bias_b >= 0.0) & (ec + (double)bias_c >= 0.0);
+            const Wide within = (ea + bias_a >= 0.0) & (eb + bias_b >= 0.0) & (ec + bias_c >= 0.0);
             const I column = x + lanes();
             I inside = __builtin_convertvector(within, I) & (column <= right);
             if (bits(inside)) {
                 const F depth = (__builtin_convertvector(ea, F) * ka + __builtin_convertvector(eb, F) * kb
                     + __builtin_convertvector(ec, F) * kc) * inv_area;
                 if (!rays && !masked && x + LANES <= target.x1) {
-                    inside &= depth > key_min;
-                    // Positive keys order as signed words too. Without a branch, and without a masked store, which is slow.
-                    S now;
-                    __builtin_memcpy(&now, keys + cell + x, sizeof(now));
-                    const S key = (__builtin_convertvector(__builtin_bit_cast(U, depth), S) << 32) | (long long)low_word;
-                    const S kept = __builtin_convertvector(inside, S) & (key > now);
-                    now ^= (now ^ key) & kept;
-                    __builtin_memcpy(keys + cell + x, &now, sizeof(now));
+                    put_row(inside, cell + x, depth, ~(unsigned)triangle);
                 } else {
                     const I inner = column < target.x1 ? column : I(target.x1 - 1);
-                    if (masked) {
-                        I mask;
-                        const I at = y * target.mask_width + inner;
-                        EACH_LANE mask[l] = target.mask.data[at[l]];
-                        inside &= mask == target.mask_value;
-                    }
-                    put_all(inside, cell + inner, depth);
+                    if (masked) inside &= igather(target.mask.data, y * target.mask_width + inner) == target.mask_value;
+                    put(inside, cell + inner, depth, n, offset, I(0), &low);
                 }
             }
             ea -= xstep_a * LANES;
@@ -226,9 +381,10 @@ wp.set_module_options({"enable_backward": False})
         eb_row += ystep_b;
         ec_row += ystep_c;
     }
-""")
+"""
+    )
 )
-def draw_lanes(
+def draw_large(
     target: TargetView,
     a: wp.vec3,
     b: wp.vec3,
@@ -243,7 +399,7 @@ def draw_lanes(
 
 
 @wp.kernel
-def draw_lanes_kernel(
+def draw_blocks_kernel(
     first: int,
     target: TargetView,
     screen: wp.array(dtype=wp.vec4),
@@ -258,39 +414,60 @@ def draw_lanes_kernel(
     row_first: int,
     row_end: int,
 ):
-    """As `raster.draw_kernel`; what has to be clipped is drawn as there."""
-    i = first + wp.tid()
-    part = i / step
-    if i - part * step >= survivor_count[part]:
-        return
-    t = survivors[i]
-    corners = triangles[t]
-    a = screen[corners[0]]
-    b = screen[corners[1]]
-    c = screen[corners[2]]
-    triangle = t + id_offset
-    if ids.shape[0] > 0:
-        triangle = ids[t]
-    plane = PlaneView()
-    if target.ray.shape[0] > 0:
-        plane = triangle_plane(points, plane_triangles[t])
-    if target.painter != 0:
-        middle = (a[2] + b[2] + c[2]) / 3.0
-        a = at_depth(a, middle)
-        b = at_depth(b, middle)
-        c = at_depth(c, middle)
-    if needs_clipping(a) or needs_clipping(b) or needs_clipping(c):
-        draw_clipped(target, a, b, c, plane, triangle, row_first, row_end)
-    else:
-        draw_lanes(
-            target,
-            wp.vec3(a[0], a[1], a[2]),
-            wp.vec3(b[0], b[1], b[2]),
-            wp.vec3(c[0], c[1], c[2]),
-            plane,
-            triangle,
-            row_first,
-            row_end,
-            RAY_ALONG_MIN,
-            RAY_TRUST,
-        )
+    """As `raster.draw_kernel`, one thread per block of a slice's survivors: slices begin at multiples of `BLOCK`."""
+    begin = (first + wp.tid()) * BLOCK
+    part = begin / step
+    count = wp.min(part * step + survivor_count[part] - begin, BLOCK)
+    left = draw_block(
+        target,
+        screen,
+        triangles,
+        ids,
+        id_offset,
+        survivors,
+        begin,
+        count,
+        points,
+        plane_triangles,
+        row_first,
+        row_end,
+        GUARD,
+        RAY_ALONG_MIN,
+        RAY_TRUST,
+    )
+    i = begin
+    while left != wp.uint64(0):
+        if (left & wp.uint64(1)) != wp.uint64(0):
+            t = survivors[i]
+            corners = triangles[t]
+            a = screen[corners[0]]
+            b = screen[corners[1]]
+            c = screen[corners[2]]
+            triangle = t + id_offset
+            if ids.shape[0] > 0:
+                triangle = ids[t]
+            plane = PlaneView()
+            if target.ray.shape[0] > 0:
+                plane = triangle_plane(points, plane_triangles[t])
+            if target.painter != 0:
+                middle = (a[2] + b[2] + c[2]) / 3.0
+                a = at_depth(a, middle)
+                b = at_depth(b, middle)
+                c = at_depth(c, middle)
+            if needs_clipping(a) or needs_clipping(b) or needs_clipping(c):
+                draw_clipped(target, a, b, c, plane, triangle, row_first, row_end)
+            else:
+                draw_large(
+                    target,
+                    wp.vec3(a[0], a[1], a[2]),
+                    wp.vec3(b[0], b[1], b[2]),
+                    wp.vec3(c[0], c[1], c[2]),
+                    plane,
+                    triangle,
+                    row_first,
+                    row_end,
+                    RAY_ALONG_MIN,
+                    RAY_TRUST,
+                )
+        left = left >> wp.uint64(1)
+        i += 1
