@@ -99,6 +99,13 @@ CASES = {
         owns=("finishes.glossy_filter", "finishes.layer_map"),
         twin={"settings": {}},
     ),
+    "roughness in a map": Case(
+        "environment",
+        {"environment_resolution": 16},
+        mirror=dataclasses.replace(CHROME, roughness=0.2),
+        owns=("finishes.glossy_prefiltered",),
+        twin={"mirror": CHROME},
+    ),
     "clearcoat": Case(
         mirror=dataclasses.replace(CHROME, roughness=0.2, clearcoat=1.0, clearcoat_roughness=0.02),
         owns=("finishes.coat",),

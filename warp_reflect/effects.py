@@ -79,7 +79,7 @@ def finish_effects(
     return {
         "waves": waves,
         "normal_map": normal_map,
-        "roughness": _roughness(material, settings),
+        "roughness": _roughness(material, settings, technique),
         "clearcoat": _clearcoat(material, settings),
         "fade": _fade(finish, technique),
     }
@@ -215,16 +215,27 @@ def _frost_fade(finish: FinishData) -> Effect:
     return Effect(True, f"to 1/e over {finish.frost_distance:g}", numbers)
 
 
-def _roughness(material: MaterialData, settings: Settings) -> Effect:
+def glossy_way(settings: Settings, technique: str) -> tuple[str, str]:
+    """(How rough mirrors of a technique are shown, one of `settings.GLOSSY` but auto; why)."""
+    asked = settings.glossy
+    if technique in MAPS and asked == "auto":
+        return "prefiltered", "its map is prefiltered, glossy=auto"
+    if technique not in MAPS and asked == "prefiltered":
+        return "gather", "no map to prefilter: as gather, glossy=prefiltered"
+    return ("gather", "as gather, glossy=auto") if asked == "auto" else (asked, f"glossy={asked}")
+
+
+def _roughness(material: MaterialData, settings: Settings, technique: str) -> Effect:
     if settings.glossy == "off":
         return Effect(False, "glossy=off")
     textured = "roughness" in material.textures
     value = f"roughness {material.roughness:.3g}{' (mean of its texture)' if textured else ''}"
     least = settings.glossy_min_roughness
-    numbers = {"roughness": material.roughness}
+    way, how = glossy_way(settings, technique)
+    numbers = {"roughness": material.roughness, "way": way}
     if not textured and material.roughness <= least:
         return Effect(False, f"{value} <= {least:g} (glossy_min_roughness)", numbers)
-    return Effect(True, f"{value} > {least:g} (glossy_min_roughness), glossy={settings.glossy}", numbers)
+    return Effect(True, f"{value} > {least:g} (glossy_min_roughness), {how}", numbers)
 
 
 def _normal_map(material: MaterialData, settings: Settings, technique: str) -> Effect:

@@ -11,7 +11,7 @@ cube, where three faces meet, the mean of the three.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import warp as wp
@@ -81,11 +81,13 @@ class CubeMaps:
         view: For kernels.
         centres: Their eyes, world, float64 [count, 3].
         axes: Columns are a map's axes, world, float64 [count, 3, 3].
+        filtered: What finishes made of them, `finishes.glossy_prefiltered.Levels`.
     """
 
     view: CubeMapsView
     centres: np.ndarray
     axes: np.ndarray
+    filtered: list = field(default_factory=list, compare=False, repr=False)
 
     @property
     def count(self) -> int:

@@ -37,10 +37,11 @@ ROWS = {
     "clearcoat": ("finishes.coat",),
     "fade": ("finishes.fade",),
 }
-# The setting `glossy` to those of rough mirrors.
+# The way of rough mirrors, `effects.glossy_way`, to those of them.
 GLOSSY = {
     "filter": ("finishes.glossy_filter", "finishes.layer_map"),
     "gather": ("finishes.glossy_rays", "finishes.glossy_gather"),
+    "prefiltered": ("finishes.glossy_prefiltered",),
     "accumulate": ("finishes.glossy_rays",),
 }
 
@@ -89,7 +90,7 @@ def of_plan(plan: Plan) -> list[str]:
             # One map alone is blended in vectors whatever `rem_count` is: that one is compiled where it is launched.
             fits = row.settings.local_edge % ROW_MULTIPLE == 0 and row.settings.rem_count <= 2
             asked.append("|techniques.local_map_vector" if fits else "techniques.local_map")
-        asked += GLOSSY[row.settings.glossy] if "roughness" in on else ()
+        asked += GLOSSY[row.effects["roughness"].numbers["way"]] if "roughness" in on else ()
     if any(pane.pixels > 0 for pane in plan.panes):
         asked += ["transmission", "|transmission_vector"]
     return _of(asked, vector)

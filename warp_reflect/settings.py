@@ -69,7 +69,7 @@ REM_MISSING = ("shade", "best")
 ENVIRONMENT_UPDATES = ("static", "frame", "previous")
 FIELDS = ("auto", "heightfield", "occupancy")
 BUMPS = ("lookup", "traced", "off")
-GLOSSY = ("gather", "filter", "accumulate", "off")
+GLOSSY = ("auto", "gather", "prefiltered", "filter", "accumulate", "off")
 KERNELS = ("auto", "plain", "vector")
 WAVES = ("lookup", "traced", "off")
 
@@ -211,15 +211,17 @@ class Settings:
     bumps: str = "traced"
     """Normal maps of mirrors: `traced` follows every turned ray, `lookup` looks it up in the smooth picture first,
     `off` reflects at the surface itself."""
-    glossy: str = "gather"
-    """Rough mirrors: `gather` (a few rays of the lobe a pixel, shared by neighbours), `filter` (look-ups in the sharp picture),
-    `accumulate` (rays of the lobe: the reference), or `off`."""
+    glossy: str = "auto"
+    """Rough mirrors: `gather` (a few rays of the lobe a pixel, shared by neighbours), `prefiltered` (look-ups in a map's filtered
+    levels), `auto` (that where the technique is a map, else gather), `filter` (look-ups in the sharp picture), `accumulate` (rays
+    of the lobe: the reference), or `off`."""
     glossy_samples: int = 0
-    """Look-ups or rays a pixel of a rough mirror; 0: the method's own (gather 6, filter 16, accumulate 256)."""
+    """Look-ups or rays a pixel of a rough mirror; 0: the method's own (gather 6, prefiltered 1, filter 16, accumulate
+    256)."""
     glossy_neighbours: int = 16
-    """`glossy=gather`: pixels around one whose rays it shares, where their lobes overlap its own; 0: it has but its own."""
+    """Of `gather`: pixels around one whose rays it shares, where their lobes overlap its own; 0: it has but its own."""
     glossy_smooth: float = 0.3
-    """`glossy=gather`: grain is smoothed over pixels that see the same up to this share of their lobes' width; 0: it is left."""
+    """Of `gather`: grain is smoothed over pixels that see the same up to this share of their lobes' width; 0: it is left."""
     glossy_min_roughness: float = 0.01
     """A mirror up to this roughness is shown sharp; a lobe of 0.01 is a fifth of a pixel wide at a focal length of 1000."""
     reflector_max_roughness: float = 0.3

@@ -2,7 +2,8 @@
 
 `glossy=accumulate` follows 256 rays of the lobe a pixel (`glossy_rays.py`): the reference. `glossy=gather` follows a few, and
 neighbouring pixels share what these meet (`glossy_gather.py`). `glossy=filter` looks the lobe's directions up in the sharp
-picture (`glossy_filter.py`), and follows none.
+picture (`glossy_filter.py`), and follows none. `glossy=prefiltered` looks lobes up in the map of a mirror whose technique is
+one (`glossy_prefiltered.py`). `effects.glossy_way` says which it is.
 
 All weigh a direction by Fresnel's term at its own microfacet and by Smith's masking, over the weight that the surface gives
 its sharp mirror. A lobe never gives more than that weight: the layers below have only given up as much.
@@ -20,7 +21,12 @@ from warp_reflect.scene import Scene
 
 BASE, COAT = 0, 1
 # The module of each method, with `SAMPLES` and `radiance_of`.
-METHODS = {"filter": "glossy_filter", "gather": "glossy_gather", "accumulate": "glossy_rays"}
+METHODS = {
+    "filter": "glossy_filter",
+    "gather": "glossy_gather",
+    "prefiltered": "glossy_prefiltered",
+    "accumulate": "glossy_rays",
+}
 
 
 def apply(
@@ -46,5 +52,5 @@ def lobe_radiance(
     Returns:
         vec3 [layer.pixels.count].
     """
-    method = importlib.import_module(f"warp_reflect.finishes.{METHODS[row.settings.glossy]}")
+    method = importlib.import_module(f"warp_reflect.finishes.{METHODS[row.effects['roughness'].numbers['way']]}")
     return method.radiance_of(scene, shown, layer, sharp, row, which, row.settings.glossy_samples or method.SAMPLES)
