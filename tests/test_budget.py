@@ -9,13 +9,29 @@ import pytest
 from rooms import placed, render, room, sphere
 
 import warp_reflect as wr
-from warp_reflect import choice
-from warp_reflect.budget import BUILT_IN, Costs, Work, fixed_ms, loss, predict, speedup
+from warp_reflect import choice, direct, launch
+from warp_reflect.budget import (
+    BUILT_IN,
+    GLOSSY_RAYS,
+    TRACE_BASE,
+    Costs,
+    Work,
+    fixed_ms,
+    lobe_ms,
+    loss,
+    predict,
+    shadow_ray_ms,
+    speedup,
+    through_ms,
+)
 from warp_reflect.choice import Option, Spent, choose, frontier, options_of
+from warp_reflect.effects import lobe_rays, pane_rays
+from warp_reflect.finishes import glossy_gather, glossy_rays
 from warp_reflect.planner import keep_pace
 from warp_reflect.realised import realised_error
-from warp_reflect.scene import Note, Scene
+from warp_reflect.scene import LightData, MaterialData, Note, Scene
 from warp_reflect.settings import Settings
+from warp_reflect.shadows import first_count, light_shares
 
 SIZE = (160, 90)
 ONES = Costs(**{each.name: 1.0 for each in dataclasses.fields(Costs)})
@@ -83,6 +99,16 @@ def test_error_grows_with_what_is_left_approximate():
     assert iterations == sorted(iterations, reverse=True)
     assert error(refine="off", grid_error_px=0.2) == pytest.approx(error(refine="off") + 0.2)
     assert error("quadric", refine="off", reuse_px=0.5) == pytest.approx(error("quadric", refine="off") + 0.5)
+
+
+def test_lobes_cost_their_rays_and_these_their_shadows():
+    asked = Settings(glossy="gather")
+    assert lobe_ms(1000, 6, TRACE_BASE, 0.0, asked, ONES) == pytest.approx(1e-3 * 6000 * 2)
+    assert lobe_ms(1000, 6, TRACE_BASE, 0.5, asked, ONES) == pytest.approx(1e-3 * 6000 * 2 + 6000 * 0.5)
+    assert lobe_ms(1000, 0, TRACE_BASE, 0.5, Settings(glossy="filter"), ONES) == pytest.approx(1.0)
+    assert through_ms(1000, 0.5, ONES) == pytest.approx(1.0 + 500.0)
+    assert shadow_ray_ms(TRACE_BASE, ONES) == pytest.approx(1e-3) and shadow_ray_ms(256, ONES) == pytest.approx(5e-4)
+    assert GLOSSY_RAYS["gather"] == glossy_gather.SAMPLES and GLOSSY_RAYS["accumulate"] == glossy_rays.SAMPLES
 
 
 def test_a_frame_costs_its_view_whatever_is_chosen():
@@ -348,3 +374,63 @@ def test_realised_error_of_rays_is_none_and_of_a_near_map_is_large(ball_room):
 
 def test_realised_error_without_mirrors_is_of_nothing(ball_room):
     assert realised_error(render(ball_room, "none")).pixels == 0
+
+
+# What is predicted to be asked, and what is.
+
+
+def changed(material, lights=()):
+    data = room(sphere(), placed(0, 0, 0)).data
+    return dataclasses.replace(data, materials=[material, data.materials[1]], lights=list(lights))
+
+
+def launched(frame_of, part: str) -> int:
+    with launch.recorded() as launches:
+        frame_of()
+    return sum(count for name, count in launches if part in name)
+
+
+@pytest.mark.parametrize(
+    "settings, rays",
+    [({"glossy": "gather"}, 6), ({"glossy": "accumulate", "glossy_samples": 9}, 9), ({"glossy": "filter"}, 0)],
+)
+def test_rays_of_rough_mirrors_are_those_predicted(settings, rays, device):
+    rough = MaterialData(base_color=(0.9, 0.9, 0.9), metallic=1.0, roughness=0.2)
+    scene = Scene(changed(rough), device)
+    plan = planned(scene, **settings)
+    (row,) = plan.rows
+    assert lobe_rays(row.effects, row.settings) == [rays]
+    asked = launched(lambda: wr.render_frame(scene, plan), "jitter_kernel")
+    assert asked == rays * row.pixels
+    sharp = planned(scene, glossy="off")
+    assert plan.fixed_ms > sharp.fixed_ms and plan.predicted["first_ms"] > sharp.predicted["first_ms"]
+
+
+@pytest.mark.parametrize("glass", [MaterialData(opacity=0.3), MaterialData(transmission=1.0, roughness=0.0)])
+def test_rays_behind_panes_are_about_those_predicted(glass, device):
+    scene = Scene(changed(glass), device)
+    plan = planned(scene, "none", refraction="traced")
+    (pane,) = plan.panes
+    predicted = pane_rays(pane.pixels, pane.interface, pane.effects, pane.settings)
+    asked = launched(lambda: wr.render_frame(scene, plan), "trace_onward_kernel")
+    assert pane.pixels > 500 and 0.5 * asked <= predicted <= 2.0 * asked
+    assert plan.fixed_ms > planned(Scene(changed(MaterialData()), device), "none").fixed_ms
+
+
+def test_shadow_rays_are_about_those_predicted(device):
+    lamp = LightData("/lamp", "sphere", (9.0, 9.0, 9.0), placed(1.0, 3.0, 1.0), size=(0.8,))
+    scene = Scene(changed(MaterialData(), [lamp]), device)
+    plan = planned(scene, "none", shadow_min_share=0.0)
+    numbers = plan.lights[0].effects["shadows"].numbers
+    frame = wr.render_frame(scene, plan)
+    # All samples are sent where a first ray of the 3 x 3 pixels around finds another thing.
+    _, unshadowed, free = light_shares(scene, direct.points_of(scene, frame.gbuffer), 1)
+    lit = unshadowed[:, 0].sum(axis=1) > 0.0
+    image = np.where(lit, free[:, 0], np.nan).reshape(SIZE[1], SIZE[0])
+    around = np.stack([np.roll(image, (y, x), (0, 1)) for y in (-1, 0, 1) for x in (-1, 0, 1)])
+    parted = (np.nanmax(around, axis=0, initial=0.0) > np.nanmin(around, axis=0, initial=1.0)).ravel() & lit
+    assert parted.sum() > 200
+    samples = plan.settings.shadow_samples
+    asked = lit.sum() * first_count(samples) + parted.sum() * samples
+    assert asked / 1.3 <= numbers["rays"] <= 1.3 * asked, (asked, numbers)
+    assert parted.sum() / 1.3 <= numbers["penumbra"] * numbers["lit"] * numbers["points"] <= 1.3 * parted.sum()

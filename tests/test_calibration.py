@@ -115,6 +115,10 @@ def test_calibration_scenes_hold_what_is_measured(device):
     for kind, technique in (("ball", "quadric"), ("ball", "reflector_map"), ("wall", "planar"), ("hollow", "quadric")):
         (row,) = wr.make_plan(calibrate._scene(kind, device), size=(64, 36), method=technique).rows
         assert row.technique == technique and row.pixels > 0, row.reason
+    (rough,) = wr.make_plan(calibrate._scene("rough", device), size=(64, 36), method="reference").rows
+    assert rough.effects["roughness"].on and rough.pixels > 0
+    (pane,) = wr.make_plan(calibrate._scene("pane", device), size=(64, 36), method="none").panes
+    assert pane.pixels > 0
     settings = wr.Settings(shadow_min_share=0.0)
     plan = wr.make_plan(calibrate._scene("lamp", device), size=(64, 36), settings=settings, method="none")
     assert plan.lights[0].effects["shadows"].numbers["rays"] > 0

@@ -66,8 +66,13 @@ class Costs:
     """A pixel of the picture: drawn, its mirror found, shaded."""
     mirror_pixel: float = 0.2
     """A mirror pixel: its point and normal, and the shading of what it shows."""
-    shadow: float = 0.8
-    """A ray towards a light, that only asks whether anything is in the way, the rest of shadowing included."""
+    gathered: float = 1.2
+    """A ray of a rough mirror's lobe, beyond following it and its shadows: drawn, shaded, shared with neighbours."""
+    through: float = 0.7
+    """A ray behind a transparent surface, beyond its shadows: bent, followed, shaded, added."""
+    shadow: float = 0.5
+    """A ray towards a light through `TRACE_BASE` triangles, that only asks whether anything is in the way, the rest of
+    shadowing included."""
     layer: float = 400.0
     """A reflector: what does not depend on counts."""
     sharing: float = 0.85
@@ -76,6 +81,10 @@ class Costs:
 
 BUILT_IN = Costs()
 TRACE_BASE = 65536  # triangles at which `Costs.trace` is told
+# Rays of a pixel of a rough mirror that are followed, by `glossy`: `SAMPLES` of `finishes.glossy_gather` and `glossy_rays`,
+# whose import would build Warp's modules before they are asked for.
+GLOSSY_RAYS = {"gather": 6, "accumulate": 256, "filter": 0, "off": 0}
+FILTER_LOOKS = 16  # look-ups of `filter` that cost as much as a gathered ray's
 COLD_SHARE = 0.1  # of frames that start from nothing: of those of a walk few do, a single picture does
 DOUBT_SHARE = 0.05  # of the mirror pixels that refinement leaves to the BVH, at the finest edges
 DOUBT_UNCUT = 0.3  # the same where edges are not cut
@@ -186,6 +195,53 @@ def fixed_ms(triangles: int, pixels: int, mirror_pixels: int, costs: Costs = BUI
     return 1e-3 * spent / speedup(costs, threads)
 
 
+def lobe_ms(
+    pixels: int,
+    rays: int,
+    triangles: int,
+    shadow_ms: float,
+    settings: Settings,
+    costs: Costs = BUILT_IN,
+    threads: int = 1,
+) -> float:
+    """Predicted milliseconds of the rays of a rough mirror's lobe, or of a turned one's.
+
+    Args:
+        pixels: At which it is seen.
+        rays: Of each.
+        triangles: Of the scene.
+        shadow_ms: Of the shadows of one point, on these threads.
+        settings: `glossy`.
+        costs, threads: See `predict`.
+    """
+    if settings.glossy == "filter" and not rays:
+        return (
+            1e-3
+            * pixels
+            * (settings.glossy_samples or FILTER_LOOKS)
+            / FILTER_LOOKS
+            * costs.gathered
+            / speedup(costs, threads)
+        )
+    return pixels * rays * (1e-3 * (ray_us(triangles, costs) + costs.gathered) / speedup(costs, threads) + shadow_ms)
+
+
+def through_ms(rays: int, shadow_ms: float, costs: Costs = BUILT_IN, threads: int = 1) -> float:
+    """Predicted milliseconds of so many rays behind transparent surfaces; `shadow_ms` as for `lobe_ms`."""
+    return rays * (1e-3 * costs.through / speedup(costs, threads) + shadow_ms)
+
+
+def ray_us(triangles: int, costs: Costs = BUILT_IN) -> float:
+    """Microseconds of a ray through a BVH of so many triangles, on one thread."""
+    return costs.trace * math.log2(max(triangles, 2)) / math.log2(TRACE_BASE)
+
+
+def shadow_ray_ms(triangles: int, costs: Costs = BUILT_IN, threads: int = 1) -> float:
+    """Milliseconds of a ray towards a light in a scene of so many triangles."""
+    deep = math.log2(max(triangles, 2)) / math.log2(TRACE_BASE)
+    return 1e-3 * costs.shadow * deep / speedup(costs, threads)
+
+
 def speedup(costs: Costs, threads: int) -> float:
     """How much faster several threads are than one."""
     return 1.0 + costs.sharing * (threads - 1)
@@ -212,7 +268,7 @@ def _texels(technique: str, settings: Settings) -> int:
 
 def _microseconds(work: Work, technique: str, settings: Settings, costs: Costs) -> tuple[float, float]:
     """(of a frame that follows another, of one that starts from nothing) on one thread."""
-    ray = costs.trace * math.log2(max(work.scene_triangles, 2)) / math.log2(TRACE_BASE)
+    ray = ray_us(work.scene_triangles, costs)
     if technique == "raytraced":
         return (costs.layer + work.pixels * ray,) * 2
     if technique == "environment":

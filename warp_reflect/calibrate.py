@@ -17,7 +17,7 @@ from collections.abc import Callable
 import numpy as np
 import warp as wp
 
-from warp_reflect.budget import BUILT_IN, TRACE_BASE, Costs
+from warp_reflect.budget import BUILT_IN, GLOSSY_RAYS, TRACE_BASE, Costs
 from warp_reflect.frame import Frame, render_frame
 from warp_reflect.launch import thread_count
 from warp_reflect.planner import Plan, make_plan
@@ -46,6 +46,8 @@ HALF = 5.0  # of the room: closed, so that rays go as deep as in rooms that are 
 STEP = 0.004  # by which the eye moves between two frames, of its distance to the mirror
 SEED = 7
 CHROME = MaterialData(base_color=(0.9, 0.9, 0.9), metallic=1.0, roughness=0.0)
+ROUGHNESS = 0.2
+LAMP = 1.0  # radius: penumbras are as wide as in rooms that are no tests
 GRID_PX = 0.5
 LOCAL_SIDE = 64  # texels along an edge of a local map
 UNBENT_PX = 1.0e4  # edges are looked at, none is cut
@@ -120,6 +122,13 @@ def _measure(device: str, repeats: int, told: Callable[[str], None]) -> Costs:
     lit = _scene("lamp", device)
     dark, bright = _timed(lit, "none", repeats, shadows="off"), _timed(lit, "none", repeats, shadow_min_share=0.0)
     found["shadow"] = (bright.us("shade") - dark.us("shade")) / max(bright.shadow_rays, 1)
+    found["shadow"] *= math.log2(TRACE_BASE) / math.log2(lit.triangle_count)
+    told("rough mirrors and panes")
+    rough = _timed(_scene("rough", device), "reference", repeats, glossy="gather")
+    lobe = (rough.us("shade") - traced.us("shade")) / (rough.pixels * GLOSSY_RAYS["gather"])
+    found["gathered"] = max(lobe - ray, 0.1 * lobe)
+    pane = _timed(_scene("pane", device), "none", repeats)
+    found["through"] = pane.us("transmission") / pane.panes
     found["sharing"] = _sharing(ball, device, repeats, traced)
     return Costs(**{name: _likely(name, value) for name, value in found.items()})
 
@@ -135,6 +144,7 @@ class _Measured:
     scene_vertices: int
     triangles: int
     shadow_rays: int
+    panes: int
 
     @property
     def vertices(self) -> int:
@@ -171,6 +181,7 @@ def _timed(scene: Scene, method: str, repeats: int, warm: bool = False, size=SIZ
         scene.vertex_count - own,
         sum(len(mesh.host_triangles) for mesh in meshes),
         sum(int(row.effects["shadows"].numbers.get("rays", 0)) for row in plan.lights),
+        sum(pane.pixels for pane in plan.panes),
     )
 
 
@@ -207,17 +218,22 @@ def _likely(name: str, value: float) -> float:
 
 
 def _scene(kind: str, device: wp.DeviceLike) -> Scene:
-    """A mirror in a room among balls: a sphere, a square, or a bowl; or the room with a lamp."""
+    """A mirror in a room among balls: a sphere, a rough one, a square, or a bowl; a pane; or the room with a lamp."""
     mesh, where, cells, balls = ball(analytic=True), _placed(0.0, 0.0, 0.0), WALL_CELLS, BALLS
-    camera, lights = _placed(0.1, 0.3, 4.0), []
-    if kind == "wall":
+    camera, lights, material = _placed(0.1, 0.3, 4.0), [], CHROME
+    if kind == "rough":
+        material = dataclasses.replace(CHROME, roughness=ROUGHNESS)
+    elif kind == "pane":
+        material = MaterialData(opacity=0.5)
+    if kind in ("wall", "pane"):
         mesh = square(2, 2.0)
         where = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, -1.5], [0, 0, 0, 1]])
     elif kind == "hollow":
         mesh = _bowl(mesh)
         where, cells, balls, camera = _placed(0.0, 0.0, 0.0, 6.0), 2, 1, _placed(0.1, 0.3, 3.0)
     elif kind == "lamp":
-        lights = [LightData("/lamp", "sphere", (9.0, 9.0, 9.0), _placed(1.0, 3.0, 1.0), size=(0.4,))]
+        lights = [LightData("/lamp", "sphere", (9.0, 9.0, 9.0), _placed(1.0, 3.0, 1.0), size=(LAMP,))]
+        balls *= 4
     rng = np.random.default_rng(SEED)
     instances = [InstanceData(0, where, "/mirror", (0,))]
     for axis, side in itertools.product(range(3), (-1.0, 1.0)):
@@ -232,7 +248,7 @@ def _scene(kind: str, device: wp.DeviceLike) -> Scene:
             balls -= 1
     meshes = [mesh, square(cells, HALF), ball()]
     view = CameraData("/camera", camera, near=0.05, focal_length=22.0)
-    return Scene(SceneData("calibration", meshes, instances, [CHROME, MaterialData()], lights, [view]), str(device))
+    return Scene(SceneData("calibration", meshes, instances, [material, MaterialData()], lights, [view]), str(device))
 
 
 def _placed(x: float, y: float, z: float, scale: float = 1.0) -> np.ndarray:

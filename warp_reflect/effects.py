@@ -6,6 +6,7 @@ import dataclasses
 import math
 from dataclasses import dataclass, field
 
+from warp_reflect.budget import GLOSSY_RAYS
 from warp_reflect.layers import Camera
 from warp_reflect.scene import FinishData, MaterialData, PartRange, Scene
 from warp_reflect.settings import Settings
@@ -83,6 +84,29 @@ def finish_effects(
         "clearcoat": _clearcoat(material, settings),
         "fade": _fade(finish, technique),
     }
+
+
+def lobe_rays(effects: dict[str, Effect], settings: Settings) -> list[int]:
+    """Rays a pixel of each lobe or turned mirror that a reflector's effects follow; 0: the sharp picture is looked up."""
+    of_lobe = GLOSSY_RAYS[settings.glossy] and (settings.glossy_samples or GLOSSY_RAYS[settings.glossy])
+    found = [of_lobe] if effects["roughness"].on else []
+    if effects["clearcoat"].on and effects["clearcoat"].numbers["roughness"] > settings.glossy_min_roughness:
+        found.append(of_lobe)
+    bumpy = effects["normal_map"].on and settings.bumps == "traced"
+    if bumpy or (effects["waves"].on and settings.waves == "traced"):
+        found.append(1)
+    return found
+
+
+def pane_rays(pixels: int, interface: str, effects: dict[str, Effect], settings: Settings) -> int:
+    """Rays behind a transparent surface that a frame shades, expected.
+
+    Whoever looks into a body looks out of it again, but where what lies in it is drawn; further surfaces are not counted.
+    """
+    frost = settings.frost_samples if effects["frost"].on else 0
+    again = 1 + frost + (effects["waves"].on and settings.waves == "traced")
+    onward = interface == "solid" and not effects["refraction_image"].on
+    return pixels * again * (1 + onward)
 
 
 def bounce_effect(visible: bool, alone: bool, mirrored: float | None, settings: Settings) -> Effect:

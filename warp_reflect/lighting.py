@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from warp_reflect import shade
-from warp_reflect.budget import BUILT_IN, Costs, speedup
+from warp_reflect.budget import BUILT_IN, Costs, shadow_ray_ms
 from warp_reflect.direct import AREA_KINDS
 from warp_reflect.effects import Effect
 from warp_reflect.launch import thread_count
@@ -18,6 +18,9 @@ from warp_reflect.shadows import Shadows, first_count, light_shares
 
 REC709_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 PROBE_SAMPLES = 4  # rays to a shape from each point that is tried
+# All rays are sent where the first ones of 3 x 3 pixels part; the points tried tell where `PROBE_SAMPLES` do. Where any share of
+# a shape is as likely to be seen, n rays part with probability 1 - 2 / (n + 1).
+MORE_PARTED = (1.0 - 2.0 / (9.0 + 1.0)) / (1.0 - 2.0 / (PROBE_SAMPLES + 1.0))
 # Of the visible share of a shape in its penumbra, root mean square, times samples^-3/4 (`tools/bench_shadows.py`).
 PENUMBRA_ERROR = 0.4
 
@@ -40,7 +43,7 @@ def plan_lights(scene: Scene, probe: Probe | None, settings: Settings, costs: Co
         settings: The knobs.
         costs: Of the machine.
     """
-    ray_ms = 1.0e-3 * costs.shadow / speedup(costs, thread_count(scene.device, settings.threads))
+    ray_ms = shadow_ray_ms(scene.triangle_count, costs, thread_count(scene.device, settings.threads))
     tried = _tried(scene, probe, settings) if needs_probe(scene, settings) and probe is not None else None
     rows, seen = [], {"distant": 0, "area": 0}
     distant = sum(light.kind == "distant" for light in scene.data.lights)
@@ -50,7 +53,9 @@ def plan_lights(scene: Scene, probe: Probe | None, settings: Settings, costs: Co
             ms = pixels * settings.shadow_samples * ray_ms
             reason = f"dome_shadows={settings.dome_shadows}"
             reason += f"; {settings.shadow_samples} rays a point" + (f", {ms:.0f} ms predicted" if pixels else "")
-            effect = Effect(settings.dome_shadows == "on", reason, {"samples": settings.shadow_samples, "ms": ms})
+            effect = Effect(
+                settings.dome_shadows == "on", reason, {"samples": settings.shadow_samples, "points": pixels, "ms": ms}
+            )
         elif light.kind == "distant" or light.kind in AREA_KINDS:
             kind = "distant" if light.kind == "distant" else "area"
             index = seen[kind] + (distant if kind == "area" else 0)
@@ -119,11 +124,12 @@ def _effect(settings: Settings, kind: str, tried: _Tried | None, pixels: int, ra
     if tried is None:
         return Effect(False, "nothing is seen that it could light")
     rays = pixels * tried.lit
-    error = 0.0
+    error = penumbra = 0.0
     if kind == "area":
         samples = settings.shadow_samples
         least = first_count(samples)
-        rays *= least + tried.penumbra * samples
+        penumbra = min(tried.penumbra * MORE_PARTED, 1.0)
+        rays *= least + penumbra * samples
         error = min(PENUMBRA_ERROR * samples**-0.75, 0.5)
     ms = rays * ray_ms
     numbers = {
@@ -131,6 +137,9 @@ def _effect(settings: Settings, kind: str, tried: _Tried | None, pixels: int, ra
         "shadowed": tried.shadowed,
         "taken": tried.taken,
         "threshold": settings.shadow_min_share,
+        "penumbra": penumbra,
+        "lit": tried.lit,
+        "points": pixels,
         "rays": round(rays),
         "ms": ms,
         "penumbra_error": error,

@@ -19,8 +19,16 @@ from warp_reflect import (
     vector,
 )
 from warp_reflect.applicable import PREFERRED
-from warp_reflect.budget import BUILT_IN, Costs, fixed_ms, loss, predict
-from warp_reflect.effects import Effect, bounce_effect, finish_effects, pane_effects, refraction_effect
+from warp_reflect.budget import BUILT_IN, Costs, fixed_ms, lobe_ms, loss, predict, through_ms
+from warp_reflect.effects import (
+    Effect,
+    bounce_effect,
+    finish_effects,
+    lobe_rays,
+    pane_effects,
+    pane_rays,
+    refraction_effect,
+)
 from warp_reflect.launch import thread_count
 from warp_reflect.layers import Camera, GBuffer, Reflector
 from warp_reflect.lighting import LightRow, needs_probe, plan_lights, shadows_of
@@ -124,12 +132,21 @@ class Plan:
 
     @property
     def fixed_ms(self) -> float:
-        """Predicted milliseconds of a frame whatever is chosen: the eye's view and the shading."""
+        """Predicted milliseconds of a frame whatever is chosen: the eye's view, the shading, finishes, panes."""
         width, height = self.size
         seen = sum(row.pixels for row in self.rows)
-        threads = thread_count(self.scene.device, self.settings.threads)
-        shadows = sum(row.effects["shadows"].numbers.get("ms", 0.0) for row in self.lights if row.effects["shadows"].on)
-        return fixed_ms(self.scene.triangle_count, width * height, seen, self.costs, threads) + shadows
+        triangles, threads = self.scene.triangle_count, thread_count(self.scene.device, self.settings.threads)
+        cast = [row.effects["shadows"].numbers for row in self.lights if row.effects["shadows"].on]
+        shadows = sum(numbers.get("ms", 0.0) for numbers in cast)
+        point = sum(numbers.get("ms", 0.0) / max(numbers.get("points", 0), 1) for numbers in cast)
+        finishes = sum(
+            lobe_ms(row.pixels, rays, triangles, point, row.settings, self.costs, threads)
+            for row in self.rows
+            for rays in lobe_rays(row.effects, row.settings)
+        )
+        followed = [pane_rays(pane.pixels, pane.interface, pane.effects, pane.settings) for pane in self.panes]
+        panes = sum(through_ms(rays, point, self.costs, threads) for rays in followed)
+        return fixed_ms(triangles, width * height, seen, self.costs, threads) + shadows + finishes + panes
 
     @property
     def shadows(self) -> Shadows | None:
