@@ -21,6 +21,7 @@ HOUSES_A_SIDE = 4  # of a block, along either of its edges
 TREES = 8
 FRAMES = 48
 SECONDS = 2.0
+QUEUE_GAP = 18.0  # between cars of one lane
 SPEEDS = (9.0, 14.0)  # of cars [m/s]
 PAINTS = ("Chrome", "PaintRed", "PaintBlue", "PaintGold")
 
@@ -110,9 +111,10 @@ def _city(cars: int):
             w.part(f"/World/Trees/T{k}", "city_tree", (float(x), 0, float(z)))
         _maps(w, _map_places())
         for k in range(cars):
-            road, way = roads[(k // 2) % ROADS], k % 4
+            # Four lanes that cross before the camera, the first cars nearest to it.
+            road, way = float(roads[1]), k % 4
             lane = 2.8 * (1 if way in (0, 3) else -1)
-            along = -60.0 + 26.0 * (k // 4) + float(roads[1]) * (k % 3 - 1)
+            along = road + QUEUE_GAP * (1, -1)[k // 4 % 2] * (0.5 + k // 8) + (0.25 - 0.5 * (way // 2)) * QUEUE_GAP
             start = (along, 0.03, road + lane) if way % 2 == 0 else (road + lane, 0.03, along)
             _drive(w, f"/World/Cars/C{k:02d}", start, way, float(rng.uniform(*SPEEDS)), PAINTS[k % len(PAINTS)])
         x, z = roads[1], roads[1]
