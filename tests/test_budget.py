@@ -30,7 +30,7 @@ from warp_reflect.finishes import glossy_gather, glossy_rays
 from warp_reflect.planner import keep_pace
 from warp_reflect.realised import realised_error
 from warp_reflect.scene import LightData, MaterialData, Note, Scene
-from warp_reflect.settings import Settings
+from warp_reflect.settings import GLOSSY, Settings
 from warp_reflect.shadows import first_count, light_shares
 
 SIZE = (160, 90)
@@ -108,6 +108,7 @@ def test_lobes_cost_their_rays_and_these_their_shadows():
     assert lobe_ms(1000, 0, TRACE_BASE, 0.5, Settings(glossy="filter"), ONES) == pytest.approx(1.0)
     assert through_ms(1000, 0.5, ONES) == pytest.approx(1.0 + 500.0)
     assert shadow_ray_ms(TRACE_BASE, ONES) == pytest.approx(1e-3) and shadow_ray_ms(256, ONES) == pytest.approx(5e-4)
+    assert GLOSSY_RAYS.keys() >= set(GLOSSY) - {"auto"}
     assert GLOSSY_RAYS["gather"] == glossy_gather.SAMPLES and GLOSSY_RAYS["accumulate"] == glossy_rays.SAMPLES
 
 
@@ -392,14 +393,14 @@ def launched(frame_of, part: str) -> int:
 
 @pytest.mark.parametrize(
     "settings, rays",
-    [({"glossy": "gather"}, 6), ({"glossy": "accumulate", "glossy_samples": 9}, 9), ({"glossy": "filter"}, 0)],
+    [({"glossy": "auto"}, 6), ({"glossy": "accumulate", "glossy_samples": 9}, 9), ({"glossy": "filter"}, 0)],
 )
 def test_rays_of_rough_mirrors_are_those_predicted(settings, rays, device):
     rough = MaterialData(base_color=(0.9, 0.9, 0.9), metallic=1.0, roughness=0.2)
     scene = Scene(changed(rough), device)
     plan = planned(scene, **settings)
     (row,) = plan.rows
-    assert lobe_rays(row.effects, row.settings) == [rays]
+    assert lobe_rays(row.effects, row.settings, row.technique) == [rays]
     asked = launched(lambda: wr.render_frame(scene, plan), "jitter_kernel")
     assert asked == rays * row.pixels
     sharp = planned(scene, glossy="off")

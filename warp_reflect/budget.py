@@ -81,10 +81,10 @@ class Costs:
 
 BUILT_IN = Costs()
 TRACE_BASE = 65536  # triangles at which `Costs.trace` is told
-# Rays of a pixel of a rough mirror that are followed, by `glossy`: `SAMPLES` of `finishes.glossy_gather` and `glossy_rays`,
-# whose import would build Warp's modules before they are asked for.
-GLOSSY_RAYS = {"gather": 6, "accumulate": 256, "filter": 0, "off": 0}
-FILTER_LOOKS = 16  # look-ups of `filter` that cost as much as a gathered ray's
+# Rays of a pixel of a rough mirror that are followed, by `effects.glossy_way`: `SAMPLES` of `finishes.glossy_gather` and of
+# `glossy_rays`, whose import would build Warp's modules before they are asked for.
+GLOSSY_RAYS = {"gather": 6, "accumulate": 256, "filter": 0, "prefiltered": 0, "off": 0}
+LOOKS = 16  # look-ups of what follows no ray that cost as much as a gathered ray's
 COLD_SHARE = 0.1  # of frames that start from nothing: of those of a walk few do, a single picture does
 DOUBT_SHARE = 0.05  # of the mirror pixels that refinement leaves to the BVH, at the finest edges
 DOUBT_UNCUT = 0.3  # the same where edges are not cut
@@ -208,21 +208,15 @@ def lobe_ms(
 
     Args:
         pixels: At which it is seen.
-        rays: Of each.
+        rays: Of each; 0: it is looked up.
         triangles: Of the scene.
         shadow_ms: Of the shadows of one point, on these threads.
-        settings: `glossy`.
+        settings: `glossy_samples`.
         costs, threads: See `predict`.
     """
-    if settings.glossy == "filter" and not rays:
-        return (
-            1e-3
-            * pixels
-            * (settings.glossy_samples or FILTER_LOOKS)
-            / FILTER_LOOKS
-            * costs.gathered
-            / speedup(costs, threads)
-        )
+    if not rays:
+        looks = (settings.glossy_samples or LOOKS) / LOOKS
+        return 1e-3 * pixels * looks * costs.gathered / speedup(costs, threads)
     return pixels * rays * (1e-3 * (ray_us(triangles, costs) + costs.gathered) / speedup(costs, threads) + shadow_ms)
 
 

@@ -86,9 +86,10 @@ def finish_effects(
     }
 
 
-def lobe_rays(effects: dict[str, Effect], settings: Settings) -> list[int]:
+def lobe_rays(effects: dict[str, Effect], settings: Settings, technique: str) -> list[int]:
     """Rays a pixel of each lobe or turned mirror that a reflector's effects follow; 0: the sharp picture is looked up."""
-    of_lobe = GLOSSY_RAYS[settings.glossy] and (settings.glossy_samples or GLOSSY_RAYS[settings.glossy])
+    usual = GLOSSY_RAYS[glossy_way(settings, technique)[0]]
+    of_lobe = usual and (settings.glossy_samples or usual)
     found = [of_lobe] if effects["roughness"].on else []
     if effects["clearcoat"].on and effects["clearcoat"].numbers["roughness"] > settings.glossy_min_roughness:
         found.append(of_lobe)

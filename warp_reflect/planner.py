@@ -142,7 +142,7 @@ class Plan:
         finishes = sum(
             lobe_ms(row.pixels, rays, triangles, point, row.settings, self.costs, threads)
             for row in self.rows
-            for rays in lobe_rays(row.effects, row.settings)
+            for rays in lobe_rays(row.effects, row.settings, row.technique)
         )
         followed = [pane_rays(pane.pixels, pane.interface, pane.effects, pane.settings) for pane in self.panes]
         panes = sum(through_ms(rays, point, self.costs, threads) for rays in followed)
