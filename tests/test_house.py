@@ -6,6 +6,7 @@ import ast
 import importlib
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -83,9 +84,15 @@ def floor(module: str) -> int | None:
     pytest.fail(f"{module} has no floor: add it to FLOORS in {Path(__file__).name}")
 
 
+@cache
+def tree_of(module: str) -> ast.Module:
+    return ast.parse(FILES[module].read_text())
+
+
+@cache
 def imported_modules(module: str) -> set[str]:
     """Every module that a file imports, at its top or in a function, by full name."""
-    tree = ast.parse(FILES[module].read_text())
+    tree = tree_of(module)
     package = module if FILES[module].name == "__init__.py" else module.rpartition(".")[0]
     found = set()
     for node in ast.walk(tree):
@@ -120,7 +127,7 @@ def test_imports_point_down_the_floors(module):
 @pytest.mark.parametrize("module", FILES)
 def test_public_face_is_used_by_faces_only(module):
     """Below the top floor a module names the module it means: `import warp_reflect` reaches every floor."""
-    tree = ast.parse(FILES[module].read_text())
+    tree = tree_of(module)
     nodes = list(ast.walk(tree))
     whole = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
     taken = {
@@ -169,14 +176,12 @@ def is_kernel(node: ast.AST) -> bool:
     )
 
 
-KERNEL_MODULES = [
-    module for module, path in FILES.items() if any(map(is_kernel, ast.walk(ast.parse(path.read_text()))))
-]
+KERNEL_MODULES = [module for module in FILES if any(map(is_kernel, ast.walk(tree_of(module))))]
 
 
 @pytest.mark.parametrize("module", KERNEL_MODULES)
 def test_kernels_take_their_first_element_and_stand_at_module_scope(module):
-    tree = ast.parse(FILES[module].read_text())
+    tree = tree_of(module)
     top = {id(node) for node in tree.body}
     for node in filter(is_kernel, ast.walk(tree)):
         assert id(node) in top, f"{module}.{node.name} is not at module scope"
@@ -193,7 +198,7 @@ def test_kernel_modules_build_no_backward_pass(module):
 @pytest.mark.parametrize("module", KERNEL_MODULES)
 def test_kernels_are_launched_through_launch(module):
     """`launch` cuts a launch over the CPU's threads; a bare `wp.launch` would start at no element."""
-    for node in ast.walk(ast.parse(FILES[module].read_text())):
+    for node in ast.walk(tree_of(module)):
         if isinstance(node, ast.Call):
             assert ast.unparse(node.func) not in ("wp.launch", "wp.launch_tiled"), f"{module}, line {node.lineno}"
 
@@ -201,7 +206,7 @@ def test_kernels_are_launched_through_launch(module):
 @pytest.mark.parametrize("module", KERNEL_MODULES)
 def test_kernels_compile_for_cuda_without_a_gpu(module, compiled_for_cuda):
     """To PTX for the oldest and the newest architecture; with `--all-architectures` for those between as well."""
-    names = [node.name for node in ast.walk(ast.parse(FILES[module].read_text())) if is_kernel(node)]
+    names = [node.name for node in ast.walk(tree_of(module)) if is_kernel(node)]
     for architecture, texts in compiled_for_cuda(module).items():
         made = "".join(texts)
         targets = {word.rstrip(",") for line in made.splitlines() if ".target" in line for word in line.split()}
