@@ -27,7 +27,8 @@ FLOORS = {
     2: "scene scene_times reflectors environment_maps baked_maps "
     "segments layers bvh raster raster_vector shade shade_vector surface "
     "surface_vector pictures textures holes cut_shadows "
-    "normal_maps bounces direct shadows transmission transmission_vector waves waves_vector channels stage stage.* scene_field "
+    "normal_maps bounces direct shadow_starts shadow_neighbours shadows transmission "
+    "transmission_vector waves waves_vector channels stage stage.* scene_field "
     "baked_environments shadows_vector bvh_vector",
     3: "solve solver solve_device solve_plane solve_convex solve_map solve_general solve_qim solver_gradients mirrors "
     "refraction solve_refraction solver_arrays reflector_maps techniques techniques.* finishes finishes.*",

@@ -265,9 +265,10 @@ def test_shadows_are_found_bit_for_bit_as_the_plain_kernels_find_them(samples):
     points = direct.points_of(scene, raster.draw_scene(scene, camera))
     every = shadows.every_shadow(scene, samples)
     some = shadows.Shadows((False, True), (True, False, True, False, True), samples=samples)
+    shared = shadows.Shadows(every.distant, every.areas, samples=samples, shared=True)
     sky = shadows.sky_share(scene, points, samples, 1, kernels="plain").numpy()
     assert 0.0 < sky.mean() < 1.0
-    for cast in (every, some):
+    for cast in (every, some, shared):
         plain = shadows.shadowed_irradiance(scene, points, cast, 1, kernels="plain").numpy()
         assert plain.any()
         for threads in (1, 2):

@@ -14,7 +14,8 @@ from warp_reflect.cutouts import is_hole
 from warp_reflect.direct import SPHERE, AreaView, DirectView, area_irradiance
 from warp_reflect.holes import HOLES_MAX
 from warp_reflect.scene import SceneView
-from warp_reflect.shadows import FAR, RayStart, area_ray, area_shown, ray_start, sample_place, sample_shift, sky_ray
+from warp_reflect.shadow_starts import RayStart, ray_start, sample_place, sample_shift
+from warp_reflect.shadows import FAR, area_ray, area_shown, sky_ray
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FINITE_FLAGS})
 

@@ -14,7 +14,7 @@ from warp_reflect.launch import thread_count
 from warp_reflect.probe import Probe
 from warp_reflect.scene import Scene
 from warp_reflect.settings import Settings
-from warp_reflect.shadows import Shadows, first_count, light_shares
+from warp_reflect.shadows import Shadows, first_count, light_shares, shared_count
 
 REC709_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 PROBE_SAMPLES = 4  # rays to a shape from each point that is tried
@@ -74,6 +74,7 @@ def shadows_of(rows: list[LightRow], settings: Settings) -> Shadows | None:
         tuple(row.effects["shadows"].on for row in rows if row.kind in AREA_KINDS),
         settings.dome_shadows == "on",
         settings.shadow_samples,
+        settings.shadow_sharing == "on",
     )
     return cast if cast.direct or cast.domes else None
 
@@ -127,9 +128,9 @@ def _effect(settings: Settings, kind: str, tried: _Tried | None, pixels: int, ra
     error = penumbra = 0.0
     if kind == "area":
         samples = settings.shadow_samples
-        least = first_count(samples)
+        more = shared_count(samples) if settings.shadow_sharing == "on" else samples
         penumbra = min(tried.penumbra * MORE_PARTED, 1.0)
-        rays *= least + penumbra * samples
+        rays *= first_count(samples) + penumbra * more
         error = min(PENUMBRA_ERROR * samples**-0.75, 0.5)
     ms = rays * ray_ms
     numbers = {

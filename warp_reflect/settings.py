@@ -61,7 +61,7 @@ REFRACTIONS = ("auto", "drawn", "traced")
 GRID_KINDS = ("direction", "slope", "position")
 REFINEMENTS = ("exact", "strict", "off")
 OCCLUSIONS = ("exact", "painter")
-SWITCHED = ("shadows", "dome_shadows")  # settings that take a boolean for on and off
+SWITCHED = ("shadows", "shadow_sharing", "dome_shadows")  # settings that take a boolean for on and off
 SWITCHES = {"1": "on", "true": "on", "on": "on", "0": "off", "false": "off", "off": "off"}
 REM_TEXELS = ("packed", "full")
 LOCAL_RAYS = ("exact", "field")
@@ -200,6 +200,9 @@ class Settings:
     """`shadows=auto`: a light casts shadows where they take at least this share of all light off what is seen."""
     shadow_samples: int = 16
     """Rays from a point towards a shape, or into a dome; a penumbra's error falls with their 3/4th power."""
+    shadow_sharing: str = "on"
+    """`on`: from a shape's penumbra an eighth of `shadow_samples` is sent, and neighbouring pixels of one plane share what it
+    finds, but at sharp edges; or `off`: each sends all."""
     dome_shadows: str = "off"
     """`on`: domes light a point only through what it sees of the sky, `shadow_samples` rays a point; or `off`."""
     field_kind: str = "auto"
@@ -235,6 +238,7 @@ class Settings:
         _require(self.shadows in ("auto", *SWITCHES.values()), "shadows", self.shadows, "auto, on or off")
         _require(0.0 <= self.shadow_min_share <= 1.0, "shadow_min_share", self.shadow_min_share, "0 to 1")
         _require(1 <= self.shadow_samples <= 65536, "shadow_samples", self.shadow_samples, "1 to 65536 rays")
+        _require(self.shadow_sharing in SWITCHES.values(), "shadow_sharing", self.shadow_sharing, "on or off")
         _require(self.dome_shadows in SWITCHES.values(), "dome_shadows", self.dome_shadows, "on or off")
         _require(self.search in SEARCHES, "search", self.search, f"one of {', '.join(SEARCHES)}")
         _require(0.0 <= self.grid_share <= 1.0, "grid_share", self.grid_share, "0 to 1")

@@ -2,39 +2,48 @@
 
 Distant lights are asked by one ray. A shape is asked by `samples` rays to points spread over it; the share of what they
 bring that arrives multiplies the exact unshadowed irradiance of `direct.py`, so that what is wholly lit keeps it to the
-last digit. A sixteenth of the rays is sent everywhere, the rest where those of a pixel and its neighbours disagree: only
-penumbras pay for all. A dome is asked by rays in cosine-distributed directions, whatever it shows there.
+last digit. A sixteenth of the rays is sent everywhere, more where those of a pixel and its neighbours disagree: only
+penumbras pay for more, and share what they find (`shadow_neighbours.py`), or send all. A dome is asked by rays in
+cosine-distributed directions, whatever it shows there.
 
-Sources: samples in the order of Roberts' R2 sequence (The Unreasonable Effectiveness of Quasirandom Sequences, 2018),
-shifted from pixel to pixel by Jimenez' interleaved gradient noise (Next Generation Post Processing in Call of Duty:
-Advanced Warfare, SIGGRAPH 2014); the ratio of shadowed to unshadowed samples as in Heitz et al., Combining Analytic Direct
-Illumination and Stochastic Shadows, I3D 2018; ray starts on the smooth surface behind the facets as in Hanika, Hacking the
-Shadow Terminator, Ray Tracing Gems II, 2021, chapter 4. What differs from the third: nothing is filtered.
+Source: the ratio of shadowed to unshadowed samples as in Heitz et al., Combining Analytic Direct Illumination and Stochastic
+Shadows, I3D 2018.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import warp as wp
 
 from warp_reflect import launch, vector
-from warp_reflect.bvh import FINITE_FLAGS, TRACE_SPLIT_MIN, flush_direction, ray_offset, scene_facet_normal
+from warp_reflect.bvh import FINITE_FLAGS, TRACE_SPLIT_MIN, flush_direction
 from warp_reflect.direct import (
     CYLINDER,
     SPHERE,
     AreaView,
     DirectView,
     Points,
-    area_irradiance,
     shown_area,
 )
 from warp_reflect.optics import tangent_basis
-from warp_reflect.scene import SHAPE_QUADRIC, Scene, SceneView
+from warp_reflect.scene import Scene
 from warp_reflect.settings import Settings
+from warp_reflect.shadow_neighbours import (
+    BOTH,
+    DARK,
+    LIT,
+    Neighbours,
+    entry_of,
+    found_around,
+    neighbours_of,
+    place_of,
+    share_of,
+    shared_share,
+)
+from warp_reflect.shadow_starts import LEAST_SQUARE, RayStart, Starts, row_vector, sample_place, starts_of
 from warp_reflect.shapes import unit
-from warp_reflect.surface import hit_normal, shown_normal
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FINITE_FLAGS})
 # What vector kernels do elsewhere, and what tries lights for a plan.
@@ -44,18 +53,9 @@ PLAIN, TRIED = (launch.module_part(__name__, name, cpu_compiler_flags=FINITE_FLA
 # not hide it from without.
 SHORT_OF_LIGHT = wp.constant(1.0e-3)
 FAR = wp.constant(3.0e38)
-LEAST_SQUARE = wp.constant(1.0e-30)  # keeps quotients finite
 WHOLE_TURN = wp.constant(float(2.0 * np.pi))
-# 1 / g and 1 / g^2 of g^3 = g + 1.
-R2_X = wp.constant(0.7548776662466927)
-R2_Y = wp.constant(0.5698402909980532)
 FIRST_SHARE = 16  # of the samples, one in so many is asked everywhere
-NEIGHBOURS = wp.constant(1)  # pixels around one whose first rays are looked at: 25 pixels stand for a penumbra
-# What the first rays towards a shape found.
-NOTHING = wp.constant(0)  # it is below the horizon, or no point is there
-DARK = wp.constant(1)
-LIT = wp.constant(2)
-BOTH = wp.constant(3)
+SHARED_SHARE = 8  # and one in so many in penumbras where neighbours share
 
 
 @dataclass(frozen=True)
@@ -66,6 +66,7 @@ class Shadows:
     areas: tuple[bool, ...] = ()
     domes: bool = False
     samples: int = 16
+    shared: bool = False  # among neighbours, see `shadow_neighbours`
 
     @property
     def direct(self) -> bool:
@@ -84,106 +85,14 @@ def asked_shadows(scene: Scene, settings: Settings) -> Shadows | None:
     domes = settings.dome_shadows == "on"
     if settings.shadows == "off":
         return Shadows(domes=True, samples=settings.shadow_samples) if domes else None
-    cast = every_shadow(scene, settings.shadow_samples, domes)
+    cast = replace(every_shadow(scene, settings.shadow_samples, domes), shared=settings.shadow_sharing == "on")
     return cast if cast.direct or cast.domes else None
-
-
-@wp.struct
-class RayStart:
-    """Where a point's shadow rays start."""
-
-    at: wp.vec3  # the point itself
-    p: wp.vec3
-    side: wp.vec3  # the facet's unit normal on the viewer's side
-    n: wp.vec3  # the normal to shade with, on the viewer's side
-
-
-@wp.func
-def above_tangent(p: wp.vec3, corner: wp.vec3, normal: wp.vec3) -> wp.vec3:
-    """How far a point lies below the tangent plane of a corner, as a step up to it."""
-    return wp.max(wp.dot(corner - p, normal), 0.0) * normal
-
-
-@wp.func
-def ray_start(
-    scene: SceneView, triangle: int, u: float, v: float, direction: wp.vec3, normals: wp.array(dtype=wp.vec3), i: int
-) -> RayStart:
-    """The start of shadow rays from a point on a triangle that is seen along a unit direction.
-
-    On the surface that the facets stand for where that bulges out, so that a ball's facets do not shade each other.
-    """
-    tri = scene.triangles[triangle]
-    a = scene.points[tri[0]]
-    b = scene.points[tri[1]]
-    c = scene.points[tri[2]]
-    w = 1.0 - u - v
-    at = w * a + u * b + v * c
-    p = at
-    own = hit_normal(scene, triangle, u, v)
-    facet = scene_facet_normal(scene, triangle)
-    turned = wp.where(wp.dot(own, direction) > 0.0, -1.0, 1.0)
-    side = wp.where(wp.dot(facet, own) < 0.0, -turned, turned) * facet
-    index = scene.normal_index[triangle]
-    patch = scene.triangle_patch[triangle]
-    if index[0] >= 0:
-        s = turned
-        p += w * above_tangent(p, a, s * scene.normals[index[0]])
-        p += u * above_tangent(p, b, s * scene.normals[index[1]])
-        p += v * above_tangent(p, c, s * scene.normals[index[2]])
-    elif scene.patches[patch].shape == SHAPE_QUADRIC:
-        # One Newton step onto f(q) = x^2 + y^2 + a z^2 + b z - c: the point is within a facet's sagitta of it.
-        m = scene.patches[patch].unit_from_scene
-        abc = scene.patches[patch].quadric
-        q = wp.transform_point(m, p)
-        f = q[0] * q[0] + q[1] * q[1] + (abc[0] * q[2] + abc[1]) * q[2] - abc[2]
-        gradient = wp.transform_vector(wp.transpose(m), wp.vec3(2.0 * q[0], 2.0 * q[1], 2.0 * abc[0] * q[2] + abc[1]))
-        step = (-f / wp.max(wp.dot(gradient, gradient), LEAST_SQUARE)) * gradient
-        if wp.dot(step, side) > 0.0:
-            p += step
-    n = shown_normal(normals, i, own)
-    if wp.dot(n, direction) > 0.0:
-        n = -n
-    start = RayStart()
-    start.at = at
-    # The corners', not the point's own: near the origin of a large facet it is off by their rounding.
-    start.p = p + wp.max(ray_offset(a), wp.max(ray_offset(b), ray_offset(c))) * side
-    start.side = side
-    start.n = n
-    return start
 
 
 @wp.func
 def is_free(mesh_id: wp.uint64, start: RayStart, direction: wp.vec3, reach: float) -> bool:
     """Whether nothing is met on the way."""
     return not wp.mesh_query_ray_anyhit(mesh_id, start.p, flush_direction(direction), reach)
-
-
-@wp.func
-def gradient_noise(x: float, y: float) -> float:
-    """Interleaved gradient noise of a pixel, 0 to 1."""
-    a = 0.06711056 * x + 0.00583715 * y
-    b = 52.9829189 * (a - wp.floor(a))
-    return b - wp.floor(b)
-
-
-@wp.func
-def sample_shift(pixel: wp.array(dtype=int), i: int, width: int) -> wp.vec2:
-    """A pixel's own shift of the samples."""
-    number = int(i)
-    if pixel.shape[0] > 0:
-        number = pixel[i]
-    row = number // width
-    x = float(number - row * width)
-    y = float(row)
-    return wp.vec2(gradient_noise(x, y), gradient_noise(y + 113.0, x + 71.0))
-
-
-@wp.func
-def sample_place(k: int, shift: wp.vec2) -> wp.vec2:
-    """Sample k of a sequence that fills the unit square evenly from its beginning on."""
-    x = 0.5 + R2_X * float(k) + shift[0]
-    y = 0.5 + R2_Y * float(k) + shift[1]
-    return wp.vec2(x - wp.floor(x), y - wp.floor(y))
 
 
 @wp.func
@@ -280,8 +189,8 @@ def area_shown(light: AreaView, p: wp.vec3) -> AreaView:
 
 
 @wp.func
-def area_share(mesh_id: wp.uint64, light: AreaView, start: RayStart, shift: wp.vec2, count: int) -> float:
-    """Share of a shape's irradiance that arrives by so many samples, 0 to 1; 1 where none has anything to bring."""
+def area_share(mesh_id: wp.uint64, light: AreaView, start: RayStart, shift: wp.vec2, begin: int, end: int) -> float:
+    """Share of a shape's irradiance that arrives by samples begin to end, 0 to 1; 1 where none has anything to bring."""
     p = start.p
     n = start.n
     if light.kind == SPHERE and wp.length(light.centre - p) <= light.radius:
@@ -289,8 +198,8 @@ def area_share(mesh_id: wp.uint64, light: AreaView, start: RayStart, shift: wp.v
     shown = area_shown(light, p)
     brought = float(0.0)
     arrived = float(0.0)
-    k = int(0)
-    while k < count:
+    k = int(begin)
+    while k < end:
         ray = area_ray(light, shown, p, n, sample_place(k, shift))
         if ray.weight > 0.0:
             brought += ray.weight
@@ -309,89 +218,92 @@ def image_index_kernel(first: int, pixel: wp.array(dtype=int), out_index: wp.arr
     out_index[pixel[i]] = i
 
 
+@wp.func
+def start_of(starts: Starts, i: int) -> RayStart:
+    """Where a point's rays start; of the point itself nothing is kept."""
+    start = RayStart()
+    start.p = row_vector(starts.rows, 0, i)
+    start.n = row_vector(starts.rows, 3, i)
+    start.side = row_vector(starts.rows, 6, i)
+    return start
+
+
+@wp.func
+def shift_of(starts: Starts, i: int) -> wp.vec2:
+    """A point's shift of the samples."""
+    return wp.vec2(starts.rows[9, i], starts.rows[10, i])
+
+
+@wp.func
+def with_more(known: float, known_count: int, more: float, count: int) -> float:
+    """A share by `count` rays, of which so many have found what is known of it and the rest more."""
+    if known_count == 0:
+        return more
+    return (float(known_count) * known + float(count - known_count) * more) / float(count)
+
+
 @wp.kernel(module=PLAIN)
 def first_rays_kernel(
     first: int,
     mesh_id: wp.uint64,
-    scene: SceneView,
     lights: DirectView,
     cast_areas: wp.array(dtype=int),
-    triangle: wp.array(dtype=int),
-    u: wp.array(dtype=float),
-    v: wp.array(dtype=float),
-    direction: wp.array(dtype=wp.vec3),
-    normals: wp.array(dtype=wp.vec3),
-    pixel: wp.array(dtype=int),
-    width: int,
+    starts: Starts,
     count: int,
-    out_found: wp.array(dtype=wp.uint8),
+    out_around: Neighbours,
 ):
     """One thread per point: what the first rays towards each shape find."""
     i = first + wp.tid()
-    if triangle[i] < 0:
-        return
-    start = ray_start(scene, triangle[i], u[i], v[i], direction[i], normals, i)
-    shift = sample_shift(pixel, i, width)
+    place = place_of(out_around, i)
     for k in range(lights.areas.shape[0]):
-        if cast_areas[k] != 0:
-            if area_irradiance(lights.areas[k], start.at, start.n) > 0.0:
-                share = area_share(mesh_id, lights.areas[k], start, shift, count)
-                found = wp.where(share == 1.0, LIT, BOTH)
-                found = wp.where(share == 0.0, DARK, found)
-                out_found[i * lights.areas.shape[0] + k] = wp.uint8(found)
+        if cast_areas[k] != 0 and starts.unshadowed[k, i] > 0.0:
+            share = area_share(mesh_id, lights.areas[k], start_of(starts, i), shift_of(starts, i), 0, count)
+            out_around.found[k, place] = wp.uint8(entry_of(share))
 
 
-@wp.func
-def around(
-    found: wp.array(dtype=wp.uint8), index: wp.array(dtype=int), number: int, width: int, light: int, light_count: int
-) -> int:
-    """What the first rays of a pixel and its neighbours found together."""
-    height = index.shape[0] // width
-    if index.shape[0] == 0:
-        height = found.shape[0] // (width * light_count)
-    row = number // width
-    column = number - row * width
-    together = int(NOTHING)
-    for dy in range(-NEIGHBOURS, NEIGHBOURS + 1):
-        for dx in range(-NEIGHBOURS, NEIGHBOURS + 1):
-            x = column + dx
-            y = row + dy
-            if x >= 0 and x < width and y >= 0 and y < height:
-                at = y * width + x
-                if index.shape[0] > 0:
-                    at = index[at]
-                if at >= 0:
-                    together = together | int(found[at * light_count + light])
-    return together
+@wp.kernel(module=PLAIN)
+def shared_rays_kernel(
+    first: int,
+    mesh_id: wp.uint64,
+    lights: DirectView,
+    cast_areas: wp.array(dtype=int),
+    starts: Starts,
+    known_count: int,
+    count: int,
+    out_around: Neighbours,
+):
+    """One thread per point: what it has for its neighbours, `BOTH` where they have something for it."""
+    i = first + wp.tid()
+    place = place_of(out_around, i)
+    for k in range(lights.areas.shape[0]):
+        if cast_areas[k] != 0 and starts.unshadowed[k, i] > 0.0:
+            entry = int(out_around.found[k, place])
+            if found_around(out_around, k, place) == BOTH:
+                start = start_of(starts, i)
+                more = area_share(mesh_id, lights.areas[k], start, shift_of(starts, i), known_count, count)
+                entry = BOTH | entry_of(with_more(share_of(entry), known_count, more, count))
+            out_around.shared[k, place] = wp.uint8(entry)
 
 
 @wp.kernel(module=PLAIN)
 def shadowed_kernel(
     first: int,
     mesh_id: wp.uint64,
-    scene: SceneView,
     lights: DirectView,
     cast_distant: wp.array(dtype=int),
     cast_areas: wp.array(dtype=int),
-    # Points:
-    triangle: wp.array(dtype=int),
-    u: wp.array(dtype=float),
-    v: wp.array(dtype=float),
-    direction: wp.array(dtype=wp.vec3),
-    normals: wp.array(dtype=wp.vec3),
-    pixel: wp.array(dtype=int),
-    width: int,
-    # Samples:
+    starts: Starts,
+    known_count: int,
     count: int,
-    found: wp.array(dtype=wp.uint8),
-    index: wp.array(dtype=int),
+    around: Neighbours,
     out_irradiance: wp.array(dtype=wp.vec3),
 ):
-    """One thread per point: the irradiance of all lights but the domes."""
+    """One thread per point: the irradiance of all lights but the domes.
+
+    Of the samples, neighbours share `known_count`; 0: they share nothing.
+    """
     i = first + wp.tid()
-    if triangle[i] < 0:
-        return
-    start = ray_start(scene, triangle[i], u[i], v[i], direction[i], normals, i)
+    start = start_of(starts, i)
     total = wp.vec3(0.0, 0.0, 0.0)
     for k in range(lights.distant.shape[0]):
         to_light = lights.distant[k].to_light
@@ -402,22 +314,32 @@ def shadowed_kernel(
                 lit = is_free(mesh_id, start, to_light, FAR)
             if lit:
                 total += cosine * lights.distant[k].irradiance
-    shift = sample_shift(pixel, i, width)
-    number = int(i)
-    if pixel.shape[0] > 0:
-        number = pixel[i]
-    area_count = lights.areas.shape[0]
-    for k in range(area_count):
+    place = place_of(around, i)
+    for k in range(lights.areas.shape[0]):
         light = lights.areas[k]
-        unshadowed = area_irradiance(light, start.at, start.n)
+        unshadowed = starts.unshadowed[k, i]
         if unshadowed > 0.0:
             share = float(1.0)
             if cast_areas[k] != 0:
-                together = around(found, index, number, width, k, area_count)
-                if together == BOTH:
-                    share = area_share(mesh_id, light, start, shift, count)
-                elif together == DARK:
+                known = float(0.0)
+                found = int(BOTH)
+                if known_count > 0:
+                    entry = int(around.shared[k, place])
+                    found = entry & BOTH
+                    known = share_of(entry)
+                    share = float(-1.0)
+                    if found == BOTH:
+                        share = shared_share(around, starts, k, place, i)
+                else:
+                    found = found_around(around, k, place)
+                    share = float(-1.0)
+                if found == DARK:
                     share = float(0.0)
+                elif found == LIT:
+                    share = float(1.0)
+                elif share < 0.0:
+                    more = area_share(mesh_id, light, start, shift_of(starts, i), known_count, count)
+                    share = with_more(known, known_count, more, count)
             total += unshadowed * share * light.radiance
     out_irradiance[i] = total
 
@@ -426,44 +348,26 @@ def shadowed_kernel(
 def light_shares_kernel(
     first: int,
     mesh_id: wp.uint64,
-    scene: SceneView,
     lights: DirectView,
-    triangle: wp.array(dtype=int),
-    u: wp.array(dtype=float),
-    v: wp.array(dtype=float),
-    direction: wp.array(dtype=wp.vec3),
-    normals: wp.array(dtype=wp.vec3),
+    starts: Starts,
     count: int,
-    # Outputs:
-    out_normal: wp.array(dtype=wp.vec3),
-    out_unshadowed: wp.array(dtype=wp.vec3),
     out_share: wp.array(dtype=float),
 ):
     """One thread per point: light by light, the distant ones first."""
     i = first + wp.tid()
-    if triangle[i] < 0:
+    start = start_of(starts, i)
+    if wp.dot(start.n, start.n) == 0.0:
         return
-    start = ray_start(scene, triangle[i], u[i], v[i], direction[i], normals, i)
-    out_normal[i] = start.n
     distant = lights.distant.shape[0]
     light_count = distant + lights.areas.shape[0]
     for k in range(light_count):
-        unshadowed = wp.vec3(0.0, 0.0, 0.0)
         share = float(1.0)
         if k < distant:
             to_light = lights.distant[k].to_light
-            cosine = wp.dot(start.n, to_light)
-            if cosine > 0.0:
-                unshadowed = cosine * lights.distant[k].irradiance
-                if not is_free(mesh_id, start, to_light, FAR):
-                    share = float(0.0)
-        else:
-            light = lights.areas[k - distant]
-            irradiance = area_irradiance(light, start.at, start.n)
-            unshadowed = irradiance * light.radiance
-            if irradiance > 0.0:
-                share = area_share(mesh_id, light, start, sample_place(i, wp.vec2(0.0, 0.0)), count)
-        out_unshadowed[i * light_count + k] = unshadowed
+            if wp.dot(start.n, to_light) > 0.0 and not is_free(mesh_id, start, to_light, FAR):
+                share = float(0.0)
+        elif starts.unshadowed[k - distant, i] > 0.0:
+            share = area_share(mesh_id, lights.areas[k - distant], start, shift_of(starts, i), 0, count)
         out_share[i * light_count + k] = share
 
 
@@ -476,26 +380,13 @@ def sky_ray(n: wp.vec3, place: wp.vec2) -> wp.vec3:
 
 
 @wp.kernel(module=PLAIN)
-def sky_share_kernel(
-    first: int,
-    mesh_id: wp.uint64,
-    scene: SceneView,
-    triangle: wp.array(dtype=int),
-    u: wp.array(dtype=float),
-    v: wp.array(dtype=float),
-    direction: wp.array(dtype=wp.vec3),
-    normals: wp.array(dtype=wp.vec3),
-    pixel: wp.array(dtype=int),
-    width: int,
-    count: int,
-    out_share: wp.array(dtype=float),
-):
+def sky_share_kernel(first: int, mesh_id: wp.uint64, starts: Starts, count: int, out_share: wp.array(dtype=float)):
     """One thread per point: share of cosine-distributed rays that leave the scene."""
     i = first + wp.tid()
-    if triangle[i] < 0:
+    start = start_of(starts, i)
+    if wp.dot(start.n, start.n) == 0.0:
         return
-    start = ray_start(scene, triangle[i], u[i], v[i], direction[i], normals, i)
-    shift = sample_shift(pixel, i, width)
+    shift = shift_of(starts, i)
     free = float(0.0)
     asked = float(0.0)
     k = int(0)
@@ -518,6 +409,11 @@ def _flags(cast: tuple[bool, ...], device) -> wp.array:
 def first_count(samples: int) -> int:
     """Rays to a shape that are always sent."""
     return max(samples // FIRST_SHARE, 1)
+
+
+def shared_count(samples: int) -> int:
+    """Rays to a shape from points in its penumbra, where neighbours share them."""
+    return max(samples // SHARED_SHARE, 1)
 
 
 def shadowed_irradiance(
@@ -546,10 +442,10 @@ def shadowed_irradiance(
     result = wp.zeros(count, dtype=wp.vec3, device=device)
     distant, areas = _flags(cast.distant, device), _flags(cast.areas, device)
     mesh, lights = wp.uint64(scene.shadow_tracer.id), scene.lights.direct
-    at = [*_arrays(points, normals, device), points.pixel, points.width]
     if scene.has_hole is not None:
         from warp_reflect import cut_shadows  # only scenes with cut-outs need it
 
+        at = [*_arrays(points, normals, device), points.pixel, points.width]
         inputs = [mesh, scene.view, lights, distant, areas, *at, cast.samples]
         cut_shadows.cut_irradiance(inputs, result, threads)
         return result
@@ -557,21 +453,30 @@ def shadowed_irradiance(
     if any(cast.areas) and len(points.pixel):
         index = wp.full(points.width * points.height, -1, dtype=int, device=device)
         launch.launch(image_index_kernel, count, [points.pixel, index], device, threads)
+    starts = starts_of(scene, points, normals, len(areas), threads)
+    around = neighbours_of(points, index, len(areas) if any(cast.areas) else 0, cast.shared)
+    samples = first_count(cast.samples), shared_count(cast.samples) if cast.shared else 0, cast.samples
+    send = _irradiance
     if vector.chosen(kernels, device):
         from warp_reflect import shadows_vector  # which sends this module's rays
 
-        starts = shadows_vector.starts_of([scene.view, lights, *at], count, len(areas), device, threads)
-        samples = first_count(cast.samples), cast.samples
-        image = [points.pixel, points.width, index]
-        shadows_vector.irradiance(mesh, lights, [distant, areas], starts, count, samples, image, result, threads)
-        return result
-    found = wp.zeros(count * len(areas) if any(cast.areas) else 0, dtype=wp.uint8, device=device)
-    if any(cast.areas):
-        inputs = [mesh, scene.view, lights, areas, *at, first_count(cast.samples), found]
-        launch.launch(first_rays_kernel, count, inputs, device, threads, split_min=TRACE_SPLIT_MIN)
-    inputs = [mesh, scene.view, lights, distant, areas, *at, cast.samples, found, index, result]
-    launch.launch(shadowed_kernel, count, inputs, device, threads, split_min=TRACE_SPLIT_MIN)
+        send = shadows_vector.irradiance
+    send(mesh, lights, [distant, areas], starts, count, samples, around, result, threads)
     return result
+
+
+def _irradiance(mesh, lights, cast, starts, count, samples, around, out_irradiance, threads) -> None:
+    """As `shadows_vector.irradiance`."""
+    first, shared, whole = samples
+
+    def send(kernel, inputs: list) -> None:
+        launch.launch(kernel, count, [mesh, lights, *inputs], starts.rows.device, threads, split_min=TRACE_SPLIT_MIN)
+
+    if len(around.found):
+        send(first_rays_kernel, [cast[1], starts, first, around])
+        if shared:
+            send(shared_rays_kernel, [cast[1], starts, first, shared, around])
+    send(shadowed_kernel, [*cast, starts, shared, whole, around, out_irradiance])
 
 
 def sky_share(
@@ -598,19 +503,19 @@ def sky_share(
     count = len(points.triangle)
     result = wp.zeros(count, dtype=float, device=device)
     mesh = wp.uint64(scene.shadow_tracer.id)
-    at = [*_arrays(points, normals, device), points.pixel, points.width]
     if scene.has_hole is not None:
         from warp_reflect import cut_shadows
 
+        at = [*_arrays(points, normals, device), points.pixel, points.width]
         cut_shadows.cut_sky_share([mesh, scene.view, *at, samples], result, threads)
         return result
+    starts = starts_of(scene, points, normals, 0, threads)
     if vector.chosen(kernels, device):
         from warp_reflect import shadows_vector
 
-        starts = shadows_vector.starts_of([scene.view, scene.lights.direct, *at], count, 0, device, threads)
         shadows_vector.sky_share(mesh, starts, count, samples, result, threads)
         return result
-    inputs = [mesh, scene.view, *at, samples, result]
+    inputs = [mesh, starts, samples, result]
     launch.launch(sky_share_kernel, count, inputs, device, threads, split_min=TRACE_SPLIT_MIN)
     return result
 
@@ -633,33 +538,26 @@ def light_shares(
     """
     device = scene.device
     count = len(points.triangle)
-    lights = len(scene.lights.direct.distant) + len(scene.lights.direct.areas)
-    normal = wp.zeros(count, dtype=wp.vec3, device=device)
-    unshadowed = wp.zeros(count * lights, dtype=wp.vec3, device=device)
+    mesh, direct = wp.uint64(scene.shadow_tracer.id), scene.lights.direct
+    lights = len(direct.distant) + len(direct.areas)
     share = wp.zeros(count * lights, dtype=float, device=device)
-    mesh, direct, at = wp.uint64(scene.shadow_tracer.id), scene.lights.direct, _arrays(points, None, device)
+    starts = starts_of(scene, points, None, len(direct.areas), threads, numbered=True)
     if vector.chosen(kernels, device):
         from warp_reflect import shadows_vector
 
-        areas = direct.areas.numpy()
-        starts = shadows_vector.starts_of(
-            [scene.view, direct, *at, points.pixel, 0], count, len(areas), device, threads
-        )
         shadows_vector.shares(mesh, direct, starts, count, samples, share, threads)
-        n = starts.rows.numpy()[3:6, :count]
-        brought = []
-        for light in direct.distant.numpy():
-            to = light["to_light"]
-            cosine = np.maximum(n[0] * to[0] + n[1] * to[1] + n[2] * to[2], np.float32(0.0))
-            brought.append(cosine[:, None] * light["irradiance"])
-        for light, irradiance in zip(areas, starts.unshadowed.numpy(), strict=True):
-            brought.append(irradiance[:count, None] * light["radiance"])
-        return np.ascontiguousarray(n.T), np.stack(brought, 1), share.numpy().reshape(count, lights)
-    inputs = [mesh, scene.view, direct, *at, samples]
-    launch.launch(
-        light_shares_kernel, count, [*inputs, normal, unshadowed, share], device, threads, split_min=TRACE_SPLIT_MIN
-    )
-    return normal.numpy(), unshadowed.numpy().reshape(count, lights, 3), share.numpy().reshape(count, lights)
+    else:
+        inputs = [mesh, direct, starts, samples, share]
+        launch.launch(light_shares_kernel, count, inputs, device, threads, split_min=TRACE_SPLIT_MIN)
+    n = starts.rows.numpy()[3:6, :count]
+    brought = []
+    for light in direct.distant.numpy():
+        to = light["to_light"]
+        cosine = np.maximum(n[0] * to[0] + n[1] * to[1] + n[2] * to[2], np.float32(0.0))
+        brought.append(cosine[:, None] * light["irradiance"])
+    for light, irradiance in zip(direct.areas.numpy(), starts.unshadowed.numpy(), strict=True):
+        brought.append(irradiance[:count, None] * light["radiance"])
+    return np.ascontiguousarray(n.T), np.stack(brought, 1), share.numpy().reshape(count, lights)
 
 
 def _arrays(points: Points, normals: wp.array | None, device) -> list:

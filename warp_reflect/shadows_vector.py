@@ -1,7 +1,7 @@
-"""`shadows.first_rays_kernel`, `shadows.shadowed_kernel` and `shadows.sky_share_kernel` for a block of points at a time.
+"""The rays of `shadows.py`'s kernels for a block of points at a time.
 
 The same rays, to the last bit, in packets (`packets.py`): those of neighbouring points towards the same sample, or a point's
-own samples. Where the points' rays start is found first, by the plain functions.
+own samples.
 """
 
 from __future__ import annotations
@@ -9,64 +9,30 @@ from __future__ import annotations
 import warp as wp
 
 from warp_reflect import vector
-from warp_reflect.direct import CYLINDER, SPHERE, DirectView, area_irradiance
+from warp_reflect.direct import CYLINDER, SPHERE, DirectView
 from warp_reflect.launch import FINITE_FLAGS, launch
 from warp_reflect.packets import TRAVERSAL
-from warp_reflect.scene import SceneView
-from warp_reflect.shadows import DARK, LIT, NEIGHBOURS, ray_start, sample_place, sample_shift
+from warp_reflect.shadow_neighbours import (
+    DARK,
+    FLATNESS,
+    LEAST_COUNT,
+    LEAST_SPREAD,
+    LEVELS,
+    LIT,
+    NEIGHBOURS,
+    SAME_TURN,
+    SHARP,
+    Neighbours,
+)
+from warp_reflect.shadow_starts import Starts
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FINITE_FLAGS})
 
-ROWS = 11  # of `Starts.rows`: point, normal, facet's normal, shift of the samples
 BLOCK_SPLIT_MIN = 8  # blocks; what `bvh.TRACE_SPLIT_MIN` rays are
 # What `send_blocks_kernel` does.
-FIRST, ALL, EACH, SKY = 0, 1, 2, 3
-CODES = [FIRST, EACH, SKY, SPHERE, CYLINDER, DARK, LIT, NEIGHBOURS]
-
-
-@wp.struct
-class Starts:
-    """`shadows.RayStart` of points, and what else their rays need; a row a component, of at least whole blocks."""
-
-    rows: wp.array2d(dtype=float)
-    unshadowed: wp.array2d(dtype=float)  # by each shape, 0 where nothing is seen
-
-
-@wp.kernel
-def starts_kernel(
-    first: int,
-    scene: SceneView,
-    lights: DirectView,
-    triangle: wp.array(dtype=int),
-    u: wp.array(dtype=float),
-    v: wp.array(dtype=float),
-    direction: wp.array(dtype=wp.vec3),
-    normals: wp.array(dtype=wp.vec3),
-    pixel: wp.array(dtype=int),
-    width: int,
-    out_start: Starts,
-):
-    """One thread per point; `width` 0: points of no image."""
-    i = first + wp.tid()
-    areas = out_start.unshadowed.shape[0]
-    if triangle[i] < 0:
-        for row in range(ROWS):
-            out_start.rows[row, i] = 0.0
-        for k in range(areas):
-            out_start.unshadowed[k, i] = 0.0
-        return
-    start = ray_start(scene, triangle[i], u[i], v[i], direction[i], normals, i)
-    shift = sample_place(i, wp.vec2(0.0, 0.0))
-    if width > 0:
-        shift = sample_shift(pixel, i, width)
-    for k in range(3):
-        out_start.rows[k, i] = start.p[k]
-        out_start.rows[3 + k, i] = start.n[k]
-        out_start.rows[6 + k, i] = start.side[k]
-    out_start.rows[9, i] = shift[0]
-    out_start.rows[10, i] = shift[1]
-    for k in range(areas):
-        out_start.unshadowed[k, i] = area_irradiance(lights.areas[k], start.at, start.n)
+FIRST, SHARED, ALL, EACH, SKY = 0, 1, 2, 3, 4
+CODES = [FIRST, SHARED, EACH, SKY, SPHERE, CYLINDER, DARK, LIT, LEVELS, NEIGHBOURS]
+CODES += [SAME_TURN, FLATNESS, LEAST_COUNT, SHARP, LEAST_SPREAD]
 
 
 @wp.func_native(
@@ -161,30 +127,66 @@ def starts_kernel(
     constexpr int SKY = -1;
     const int area_count = lights.areas.shape[0], distant_count = lights.distant.shape[0];
     const bool to_sky = mode == sky_mode, only_first = mode == first_mode, each = mode == each_mode;
-    float sum_x[BLOCK], sum_y[BLOCK], sum_z[BLOCK], share[BLOCK], brought[BLOCK], arrived[BLOCK], before[BLOCK];
+    const bool sharing = mode == shared_mode, to_all = !to_sky && !only_first && !each && !sharing;
+    float sum_x[BLOCK], sum_y[BLOCK], sum_z[BLOCK], share[BLOCK], known[BLOCK], brought[BLOCK], arrived[BLOCK], before[BLOCK];
     int asking[BLOCK];
     for (int j = 0; j < BLOCK; ++j) sum_x[j] = sum_y[j] = sum_z[j] = 0.0f;
-    // shadows.around
-    auto around = [&](int i, int k) -> int {
-        const int number = pixel.shape[0] > 0 ? pixel.data[i] : i;
-        const int height = index.shape[0] > 0 ? index.shape[0] / width : out_found.shape[0] / (width * area_count);
-        const int row = number / width, column = number - row * width;
-        int together = 0;
-        for (int y = row - neighbours; y <= row + neighbours; ++y) {
-            if (y < 0 || y >= height) continue;
-            for (int x = column - neighbours; x <= column + neighbours; ++x) {
-                if (x < 0 || x >= width) continue;
-                int at = y * width + x;
-                if (index.shape[0] > 0) at = index.data[at];
-                if (at >= 0) together |= out_found.data[at * area_count + k];
+    // shadow_neighbours.place_of, found_around, shared_share
+    const int line = around.width + 2 * neighbours;
+    int number[BLOCK], place[BLOCK];
+    for (int j = 0; (sharing || to_all || only_first) && j < end - begin; ++j) {
+        number[j] = around.pixel.shape[0] > 0 ? around.pixel.data[begin + j] : begin + j;
+        place[j] = number[j] + 2 * neighbours * (number[j] / around.width) + neighbours * line + neighbours;
+    }
+    auto found_around = [&](const unsigned char* found, int at) -> int {
+        unsigned long long together = 0;
+        for (int y = -neighbours; y <= neighbours; ++y) {
+            unsigned long long row;
+            __builtin_memcpy(&row, found + at + y * line - neighbours, sizeof(row));
+            together |= row;
+        }
+        together &= (1ull << (8 * (2 * neighbours + 1))) - 1;
+        together |= together >> 32;
+        together |= together >> 16;
+        together |= together >> 8;
+        return (int)(together & (dark | lit));
+    };
+    auto shared_share = [&](const unsigned char* shared, int j) -> float {
+        const float* own = rows + begin + j;
+        const float p_x = own[0], p_y = own[stride], p_z = own[2 * stride];
+        const float side_x = own[6 * stride], side_y = own[7 * stride], side_z = own[8 * stride];
+        int known = 0, total = 0, squares = 0;
+        for (int y = -neighbours; y <= neighbours; ++y) {
+            for (int x = -neighbours; x <= neighbours; ++x) {
+                const int entry = shared[place[j] + y * line + x];
+                if (entry == 0) continue;
+                int i = number[j] + y * around.width + x;
+                if (around.index.shape[0] > 0) i = around.index.data[i];
+                const float* other = rows + i;
+                const float away_x = other[0] - p_x, away_y = other[stride] - p_y, away_z = other[2 * stride] - p_z;
+                const float beside = side_x * away_x + side_y * away_y + side_z * away_z;
+                const float apart = away_x * away_x + away_y * away_y + away_z * away_z;
+                const float turned = side_x * other[6 * stride] + side_y * other[7 * stride] + side_z * other[8 * stride];
+                if (!(beside * beside <= flatness * flatness * apart) || !(turned >= same_turn)) continue;
+                const int level = entry >> 2;
+                ++known;
+                total += level;
+                squares += level * level;
             }
         }
-        return together;
+        const int spread = total * (levels * known - total), between = known * squares - total * total;
+        const bool edge = sharp * between > spread && least_spread * spread > levels * levels * known * known;
+        return edge || known < least_count ? -1.0f : (float)total / (float)(levels * known);
     };
-    for (int light = to_sky ? SKY : only_first ? distant_count : 0; light < (to_sky ? 0 : distant_count + area_count); ++light) {
+    const int first_light = to_sky ? SKY : only_first || sharing ? distant_count : 0;
+    const int last_light = to_sky ? SKY : distant_count + area_count - 1;
+    for (int light = first_light; light <= last_light; ++light) {
         const bool distant = light >= 0 && light < distant_count;
         const int k = light - distant_count;
-        const int ray_count = distant ? 1 : samples;
+        const int known_count = distant ? 0 : known_samples, ray_count = distant ? 1 : samples;
+        const long pictured = light < distant_count ? 0 : k * (long)around.found.shape[1];
+        unsigned char* found = around.found.data + pictured;
+        unsigned char* shared = around.shared.data + pictured;
         // What would arrive unshadowed, `before`, and which points have to ask.
         int asking_count = 0;
         for (int j = 0; j < end - begin; ++j) {
@@ -201,10 +203,22 @@ def starts_kernel(
             } else {
                 before[j] = starts.unshadowed.data[k * stride + begin + j];
                 asks = before[j] > 0.0f && cast_areas.data[k] != 0;
-                if (asks && !only_first && !each) {
-                    const int together = around(begin + j, k);
+                if (asks && sharing) {
+                    const int entry = found[place[j]];
+                    asks = found_around(found, place[j]) == (lit | dark);
+                    known[j] = (float)(entry >> 2) / (float)levels;
+                    if (!asks) shared[place[j]] = (unsigned char)entry;
+                } else if (asks && to_all) {
+                    const int entry = known_count > 0 ? shared[place[j]] : found_around(found, place[j]);
+                    const int together = entry & (lit | dark);
                     asks = together == (lit | dark);
                     if (together == dark) share[j] = 0.0f;
+                    known[j] = (float)(entry >> 2) / (float)levels;
+                    if (asks && known_count > 0) {
+                        const float mean = shared_share(shared, j);
+                        asks = mean < 0.0f;
+                        if (!asks) share[j] = mean;
+                    }
                 }
             }
             if (!asks) continue;
@@ -212,13 +226,13 @@ def starts_kernel(
             asking[asking_count++] = j;
         }
         // Rays of a point lie side by side: they start at the same place.
-        int point = 0, sample = 0;
-        while (point < asking_count) {
+        int point = 0, sample = known_count;
+        while (point < asking_count && known_count < ray_count) {
             int of[2 * LANES], which[2 * LANES], used = 0;
             for (; used < 2 * LANES && point < asking_count; ++used) {
                 of[used] = asking[point];
                 which[used] = sample;
-                if (++sample == ray_count) { sample = 0; ++point; }
+                if (++sample == ray_count) { sample = known_count; ++point; }
             }
             for (int l = used; l < 2 * LANES; ++l) { of[l] = of[used - 1]; which[l] = which[used - 1]; }
             V p[2], d[2];
@@ -276,9 +290,13 @@ def starts_kernel(
             const int j = asking[a];
             if (brought[j] != 0.0f) share[j] = arrived[j] / brought[j];
             if (to_sky && brought[j] != 0.0f) out_share.data[begin + j] = share[j];
-            if (only_first) {
-                const int found = share[j] == 1.0f ? lit : share[j] == 0.0f ? dark : lit | dark;
-                out_found.data[(begin + j) * area_count + k] = (unsigned char)found;
+            if (known_count > 0)
+                share[j] = ((float)known_count * known[j] + (float)(ray_count - known_count) * share[j]) / (float)ray_count;
+            if (only_first || sharing) {
+                const int code = share[j] == 1.0f ? lit : share[j] == 0.0f ? dark : lit | dark;
+                const int entry = code | (int)(share[j] * (float)levels + 0.5f) << 2;
+                if (only_first) found[place[j]] = (unsigned char)entry;
+                else shared[place[j]] = (unsigned char)(entry | lit | dark);
             }
         }
         for (int j = 0; each && j < end - begin; ++j) {
@@ -286,7 +304,7 @@ def starts_kernel(
             if (n[0] == 0.0f && n[stride] == 0.0f && n[2 * stride] == 0.0f) continue;
             out_share.data[(begin + j) * (distant_count + area_count) + light] = share[j];
         }
-        if (to_sky || only_first || each) continue;
+        if (!to_all) continue;
         const auto& color = distant ? lights.distant.data[light].irradiance : lights.areas.data[k].radiance;
         for (int j = 0; j < end - begin; ++j) {
             if (!(before[j] > 0.0f)) continue;
@@ -296,7 +314,7 @@ def starts_kernel(
             sum_z[j] += arrives * color[2];
         }
     }
-    if (to_sky || only_first || each) return;
+    if (!to_all) return;
     for (int j = 0; j < end - begin; ++j) {
         float* to = (float*)(out_irradiance.data + begin + j);
         to[0] = sum_x[j]; to[1] = sum_y[j]; to[2] = sum_z[j];
@@ -312,20 +330,25 @@ def send_block(
     cast_areas: wp.array(dtype=int),
     starts: Starts,
     count: int,
+    known_samples: int,
     samples: int,
-    pixel: wp.array(dtype=int),
-    width: int,
-    index: wp.array(dtype=int),
+    around: Neighbours,
     mode: int,
     first_mode: int,
+    shared_mode: int,
     each_mode: int,
     sky_mode: int,
     sphere: int,
     cylinder: int,
     dark: int,
     lit: int,
+    levels: int,
     neighbours: int,
-    out_found: wp.array(dtype=wp.uint8),
+    same_turn: float,
+    flatness: float,
+    least_count: int,
+    sharp: int,
+    least_spread: int,
     out_irradiance: wp.array(dtype=wp.vec3),
     out_share: wp.array(dtype=float),
 ): ...
@@ -340,25 +363,30 @@ def send_blocks_kernel(
     cast_areas: wp.array(dtype=int),
     starts: Starts,
     count: int,
+    known_samples: int,
     samples: int,
-    pixel: wp.array(dtype=int),
-    width: int,
-    index: wp.array(dtype=int),
+    around: Neighbours,
     mode: int,
     first_mode: int,
+    shared_mode: int,
     each_mode: int,
     sky_mode: int,
     sphere: int,
     cylinder: int,
     dark: int,
     lit: int,
+    levels: int,
     neighbours: int,
+    same_turn: float,
+    flatness: float,
+    least_count: int,
+    sharp: int,
+    least_spread: int,
     # Outputs:
-    out_found: wp.array(dtype=wp.uint8),
     out_irradiance: wp.array(dtype=wp.vec3),
     out_share: wp.array(dtype=float),
 ):
-    """One thread per block of points; mode: `FIRST` rays, `ALL` that are worth it, `EACH` light apart, or to the `SKY`."""
+    """One thread per block of points; mode: `FIRST` rays, `SHARED` ones, `ALL` that count, `EACH` light, or the `SKY`."""
     send_block(
         first + wp.tid(),
         mesh_id,
@@ -367,33 +395,28 @@ def send_blocks_kernel(
         cast_areas,
         starts,
         count,
+        known_samples,
         samples,
-        pixel,
-        width,
-        index,
+        around,
         mode,
         first_mode,
+        shared_mode,
         each_mode,
         sky_mode,
         sphere,
         cylinder,
         dark,
         lit,
+        levels,
         neighbours,
-        out_found,
+        same_turn,
+        flatness,
+        least_count,
+        sharp,
+        least_spread,
         out_irradiance,
         out_share,
     )
-
-
-def starts_of(inputs: list, count: int, area_count: int, device, threads: int = 0) -> Starts:
-    """Where the shadow rays of points start, of `starts_kernel`'s inputs."""
-    starts = Starts()
-    padded = vector.BLOCK * vector.block_count(count)
-    starts.rows = wp.empty((ROWS, padded), dtype=float, device=device)
-    starts.unshadowed = wp.empty((area_count, padded), dtype=float, device=device)
-    launch(starts_kernel, count, [*inputs, starts], device, threads)
-    return starts
 
 
 def irradiance(
@@ -402,51 +425,51 @@ def irradiance(
     cast: list[wp.array],
     starts: Starts,
     count: int,
-    samples: tuple[int, int],
-    image: list,
+    samples: tuple[int, int, int],
+    around: Neighbours,
     out_irradiance: wp.array,
     threads: int = 0,
 ) -> None:
-    """As `shadows.first_rays_kernel` and `shadows.shadowed_kernel`.
+    """As `shadows.first_rays_kernel`, `shadows.shared_rays_kernel` and `shadows.shadowed_kernel`.
 
     Args:
         mesh: What casts shadows.
         lights: Distant ones and shapes.
         cast: Which of either cast shadows.
-        starts: From `starts_of`.
+        starts: From `shadow_starts.starts_of`.
         count: Points.
-        samples: Rays to a shape that are always sent, and all of them.
-        image: The points' pixels, the image's width, and from `shadows.image_index_kernel` where its pixels are.
+        samples: Rays to a shape that are always sent, those that neighbours share (0: they share nothing), and all of them.
+        around: From `shadow_neighbours.neighbours_of`.
         out_irradiance: vec3 [count].
         threads: CPU threads; 0: one per core.
     """
     device = out_irradiance.device
-    asked = len(cast[1]) if cast[1].numpy().any() else 0
-    found = wp.zeros(count * asked, dtype=wp.uint8, device=device)
+    first, shared, whole = samples
     none = wp.zeros(0, dtype=float, device=device)
-    for mode in (FIRST, ALL) if asked else (ALL,):
-        inputs = [mesh, lights, *cast, starts, count, samples[mode == ALL], *image, mode, *CODES]
-        _launch(count, [*inputs, found, out_irradiance, none], device, threads)
+    passes = [(ALL, shared, whole)]
+    if len(around.found):
+        passes = [(FIRST, 0, first), *([(SHARED, first, shared)] if shared else []), *passes]
+    for mode, known, sent in passes:
+        inputs = [mesh, lights, *cast, starts, count, known, sent, around, mode, *CODES]
+        _launch(count, [*inputs, out_irradiance, none], device, threads)
 
 
 def shares(
     mesh: wp.uint64, lights: DirectView, starts: Starts, count: int, samples: int, out_share: wp.array, threads: int = 0
 ) -> None:
-    """The last output of `shadows.light_shares_kernel`."""
+    """As `shadows.light_shares_kernel`."""
     device = out_share.device
-    none, no_points = wp.zeros(0, dtype=int, device=device), wp.zeros(0, dtype=wp.vec3, device=device)
     cast = [wp.full(len(kind), 1, dtype=int, device=device) for kind in (lights.distant, lights.areas)]
-    inputs = [mesh, lights, *cast, starts, count, samples, none, 0, none, EACH, *CODES]
-    _launch(count, [*inputs, wp.zeros(0, dtype=wp.uint8, device=device), no_points, out_share], device, threads)
+    inputs = [mesh, lights, *cast, starts, count, 0, samples, Neighbours(), EACH, *CODES]
+    _launch(count, [*inputs, wp.zeros(0, dtype=wp.vec3, device=device), out_share], device, threads)
 
 
 def sky_share(mesh: wp.uint64, starts: Starts, count: int, samples: int, out_share: wp.array, threads: int = 0) -> None:
     """As `shadows.sky_share_kernel`."""
     device = out_share.device
     none = wp.zeros(0, dtype=int, device=device)
-    outputs = [wp.zeros(0, dtype=kind, device=device) for kind in (wp.uint8, wp.vec3)]
-    inputs = [mesh, DirectView(), none, none, starts, count, samples, none, 0, none, SKY, *CODES]
-    _launch(count, [*inputs, *outputs, out_share], device, threads)
+    inputs = [mesh, DirectView(), none, none, starts, count, 0, samples, Neighbours(), SKY, *CODES]
+    _launch(count, [*inputs, wp.zeros(0, dtype=wp.vec3, device=device), out_share], device, threads)
 
 
 def _launch(count: int, inputs: list, device, threads: int) -> None:

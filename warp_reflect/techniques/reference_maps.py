@@ -396,7 +396,7 @@ def _errors(
 
 def _key(settings: Settings) -> tuple:
     names = ("environment_resolution", "rem_texels", "rem_limit", "rem_error_px", "shadows")
-    names += ("dome_shadows", "shadow_samples", "reflector_max_roughness", "reflector_min_weight")
+    names += ("dome_shadows", "shadow_samples", "shadow_sharing", "reflector_max_roughness", "reflector_min_weight")
     return (KEY, *(getattr(settings, name) for name in names))
 
 
