@@ -201,8 +201,8 @@ class Settings:
     shadow_samples: int = 16
     """Rays from a point towards a shape, or into a dome; a penumbra's error falls with their 3/4th power."""
     shadow_sharing: str = "on"
-    """`on`: from a shape's penumbra an eighth of `shadow_samples` is sent, and neighbouring pixels of one plane share what it
-    finds, but at sharp edges; or `off`: each sends all."""
+    """`on`: from a shape's penumbra a quarter of `shadow_samples` is sent, and neighbouring pixels of one plane share what it
+    finds, where it is wide; or `off`: each sends all."""
     dome_shadows: str = "off"
     """`on`: domes light a point only through what it sees of the sky, `shadow_samples` rays a point; or `off`."""
     field_kind: str = "auto"

@@ -1,8 +1,9 @@
 """What the first rays towards a shape found at a pixel and around it: whether points lie in a penumbra, and shares of them.
 
 Points on one plane at neighbouring pixels ask other samples of a shape, so the mean of what they found counts as many rays
-as they sent together. It is that of the middle where the share of the shape that is seen changes evenly across them; where
-an edge is sharp, points see all of it or nothing, and are told by the variance between them: they have to ask on their own.
+as they sent together. It is that of the middle where the share of the shape that is seen changes evenly across them. Where a
+penumbra is a few pixels wide it does not: points have to ask on their own where the share is steep, or where they see all of
+the shape or nothing, which the variance between them tells.
 
 Source: Heitz et al., Combining Analytic Direct Illumination and Stochastic Shadows, I3D 2018, which filters the ratio of
 shadowed to unshadowed light over the image. What differs: the filter is a box over pixels whose points lie in one plane, only
@@ -28,13 +29,16 @@ BOTH = wp.constant(3)
 LEVELS = wp.constant(63)  # of the share
 # Neighbours share what they found where they lie in the plane of a point: the cosine between facets, and the share of the
 # distance between two points that one may lie beside the other's plane.
-SAME_TURN = wp.constant(0.95)
+SAME_TURN = wp.constant(0.995)
 FLATNESS = wp.constant(0.1)
 LEAST_COUNT = wp.constant(5)  # of so few points, itself included, none learns anything
 # Variance between points of all that there could be, 1: each sees all or nothing; and the least that it must be at all, of a
 # share's square: one odd neighbour of 25 is no edge.
 SHARP = wp.constant(2)  # its reciprocal
 LEAST_SPREAD = wp.constant(20)  # its reciprocal
+# Change of the share per pixel from which on a penumbra is so narrow that its bends lie within the box: at 0.12 what bends
+# within minified shadows is off by more than 16 rays of each point are.
+STEEP = wp.constant(0.06)
 
 
 @wp.struct
@@ -93,6 +97,14 @@ def shared_share(around: Neighbours, starts: Starts, k: int, place: int, i: int)
     count = int(0)
     total = int(0)
     squares = int(0)
+    # Sums over the neighbours' offsets: theirs, of their squares, and of them times the levels.
+    sum_x = int(0)
+    sum_y = int(0)
+    square_x = int(0)
+    along_x = int(0)
+    along_y = int(0)
+    brought = float(0.0)
+    arrived = float(0.0)
     for dy in range(-NEIGHBOURS, NEIGHBOURS + 1):
         for dx in range(-NEIGHBOURS, NEIGHBOURS + 1):
             entry = int(around.shared[k, place + dy * (around.width + 2 * NEIGHBOURS) + dx])
@@ -108,12 +120,23 @@ def shared_share(around: Neighbours, starts: Starts, k: int, place: int, i: int)
                     count += 1
                     total += level
                     squares += level * level
+                    sum_x += dx
+                    sum_y += dy
+                    square_x += dx * dx
+                    along_x += dx * level
+                    along_y += dy * level
+                    brought += starts.unshadowed[k, j]
+                    arrived += starts.unshadowed[k, j] * float(level)
     spread = total * (LEVELS * count - total)
     between = count * squares - total * total
     edge = SHARP * between > spread and LEAST_SPREAD * spread > LEVELS * LEVELS * count * count
-    if edge or count < LEAST_COUNT:
+    slope_x = float(count * along_x - total * sum_x)
+    slope_y = float(count * along_y - total * sum_y)
+    limit = STEEP * float(LEVELS * count * square_x)
+    steep = slope_x * slope_x + slope_y * slope_y > limit * limit
+    if edge or steep or count < LEAST_COUNT:
         return -1.0
-    return float(total) / float(LEVELS * count)
+    return arrived / (float(LEVELS) * brought)
 
 
 def neighbours_of(points: Points, index: wp.array, area_count: int, shared: bool) -> Neighbours:

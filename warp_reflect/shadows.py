@@ -55,7 +55,7 @@ SHORT_OF_LIGHT = wp.constant(1.0e-3)
 FAR = wp.constant(3.0e38)
 WHOLE_TURN = wp.constant(float(2.0 * np.pi))
 FIRST_SHARE = 16  # of the samples, one in so many is asked everywhere
-SHARED_SHARE = 8  # and one in so many in penumbras where neighbours share
+SHARED_SHARE = 4  # and one in so many in penumbras where neighbours share
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from warp_reflect.shadow_neighbours import (
     NEIGHBOURS,
     SAME_TURN,
     SHARP,
+    STEEP,
     Neighbours,
 )
 from warp_reflect.shadow_starts import Starts
@@ -32,7 +33,7 @@ BLOCK_SPLIT_MIN = 8  # blocks; what `bvh.TRACE_SPLIT_MIN` rays are
 # What `send_blocks_kernel` does.
 FIRST, SHARED, ALL, EACH, SKY = 0, 1, 2, 3, 4
 CODES = [FIRST, SHARED, EACH, SKY, SPHERE, CYLINDER, DARK, LIT, LEVELS, NEIGHBOURS]
-CODES += [SAME_TURN, FLATNESS, LEAST_COUNT, SHARP, LEAST_SPREAD]
+CODES += [SAME_TURN, FLATNESS, LEAST_COUNT, SHARP, LEAST_SPREAD, STEEP]
 
 
 @wp.func_native(
@@ -151,11 +152,12 @@ CODES += [SAME_TURN, FLATNESS, LEAST_COUNT, SHARP, LEAST_SPREAD]
         together |= together >> 8;
         return (int)(together & (dark | lit));
     };
-    auto shared_share = [&](const unsigned char* shared, int j) -> float {
+    auto shared_share = [&](const unsigned char* shared, const float* unshadowed, int j) -> float {
         const float* own = rows + begin + j;
         const float p_x = own[0], p_y = own[stride], p_z = own[2 * stride];
         const float side_x = own[6 * stride], side_y = own[7 * stride], side_z = own[8 * stride];
-        int known = 0, total = 0, squares = 0;
+        int known = 0, total = 0, squares = 0, sum_x = 0, sum_y = 0, square_x = 0, along_x = 0, along_y = 0;
+        float brought = 0.0f, arrived = 0.0f;
         for (int y = -neighbours; y <= neighbours; ++y) {
             for (int x = -neighbours; x <= neighbours; ++x) {
                 const int entry = shared[place[j] + y * line + x];
@@ -172,11 +174,21 @@ CODES += [SAME_TURN, FLATNESS, LEAST_COUNT, SHARP, LEAST_SPREAD]
                 ++known;
                 total += level;
                 squares += level * level;
+                sum_x += x;
+                sum_y += y;
+                square_x += x * x;
+                along_x += x * level;
+                along_y += y * level;
+                brought += unshadowed[i];
+                arrived += unshadowed[i] * (float)level;
             }
         }
         const int spread = total * (levels * known - total), between = known * squares - total * total;
         const bool edge = sharp * between > spread && least_spread * spread > levels * levels * known * known;
-        return edge || known < least_count ? -1.0f : (float)total / (float)(levels * known);
+        const float slope_x = (float)(known * along_x - total * sum_x), slope_y = (float)(known * along_y - total * sum_y);
+        const float limit = steep * (float)(levels * known * square_x);
+        const bool narrow = slope_x * slope_x + slope_y * slope_y > limit * limit;
+        return edge || narrow || known < least_count ? -1.0f : arrived / ((float)levels * brought);
     };
     const int first_light = to_sky ? SKY : only_first || sharing ? distant_count : 0;
     const int last_light = to_sky ? SKY : distant_count + area_count - 1;
@@ -215,7 +227,7 @@ CODES += [SAME_TURN, FLATNESS, LEAST_COUNT, SHARP, LEAST_SPREAD]
                     if (together == dark) share[j] = 0.0f;
                     known[j] = (float)(entry >> 2) / (float)levels;
                     if (asks && known_count > 0) {
-                        const float mean = shared_share(shared, j);
+                        const float mean = shared_share(shared, starts.unshadowed.data + k * stride, j);
                         asks = mean < 0.0f;
                         if (!asks) share[j] = mean;
                     }
@@ -349,6 +361,7 @@ def send_block(
     least_count: int,
     sharp: int,
     least_spread: int,
+    steep: float,
     out_irradiance: wp.array(dtype=wp.vec3),
     out_share: wp.array(dtype=float),
 ): ...
@@ -382,6 +395,7 @@ def send_blocks_kernel(
     least_count: int,
     sharp: int,
     least_spread: int,
+    steep: float,
     # Outputs:
     out_irradiance: wp.array(dtype=wp.vec3),
     out_share: wp.array(dtype=float),
@@ -414,6 +428,7 @@ def send_blocks_kernel(
         least_count,
         sharp,
         least_spread,
+        steep,
         out_irradiance,
         out_share,
     )
