@@ -1,5 +1,7 @@
 """Shadows of every kind of light against sums in float64, and the plan that turns them on."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from test_shade import (
@@ -69,6 +71,10 @@ def test_penumbra_of_a_shape_is_the_share_of_it_that_is_seen(kind):
     part = (exact > 0.05) & (exact < 0.95)
     assert part.sum() > 30 and (exact == 0).sum() + (exact == 1).sum() > 100
     error = []
+    # What neighbours share is as good as what each asks itself.
+    shared = replace(shadows.every_shadow(scene, 16), shared=True)
+    seen = shadows.shadowed_irradiance(scene, points, shared).numpy()[:, 0]
+    assert np.sqrt(np.mean(((seen / whole)[on_ground] - exact)[part] ** 2)) < 0.08
     for samples in (4, 16, 256):
         seen = shadows.shadowed_irradiance(scene, points, shadows.every_shadow(scene, samples)).numpy()[:, 0]
         difference = (seen / whole)[on_ground] - exact
@@ -78,6 +84,24 @@ def test_penumbra_of_a_shape_is_the_share_of_it_that_is_seen(kind):
         assert np.abs(difference[exact == 0.0]).max() == 0.0
     assert error[0] < 0.2 and error[1] < 0.08 and error[2] < 0.02, error
     assert error[2] < 0.5 * error[1] < 0.5 * error[0]
+
+
+def test_neighbours_share_where_a_penumbra_is_wide_and_ask_where_it_is_narrow():
+    """Half of the error of each asking as many itself; an edge as sharp as without; what is one light or none stays so."""
+    lamp = LightData("/lamp", "rect", (1, 1, 1), turned(-1.4, 0.4, (0.3, 2.0, 0.2)), size=(1.2, 0.8))
+    small = LightData("/lamp", "sphere", (1, 1, 1), turned(0, 0, (0.3, 2.2, -0.2)), size=(0.01,))
+    for light, most in ((lamp, 0.5), (small, 1.0)):
+        scene, camera, _ = under_a_card(light, (160, 120))
+        points = direct.points_of(scene, raster.draw_scene(scene, camera))
+        whole = direct.direct_irradiance(scene, scene.lights.direct, points).numpy()[:, 0]
+        every = shadows.every_shadow(scene, 256)
+        exact = shadows.shadowed_irradiance(scene, points, every).numpy()[:, 0]
+        lit = whole > 0.0
+        error = []
+        for cast in (replace(every, samples=4), replace(every, samples=16, shared=True)):
+            seen = shadows.shadowed_irradiance(scene, points, cast).numpy()[:, 0]
+            error.append(np.sqrt(np.mean(((seen - exact)[lit] / whole[lit]) ** 2)))
+        assert 0.0 < error[1] < most * error[0], error
 
 
 def test_no_light_below_the_horizon_or_from_behind_a_shape():

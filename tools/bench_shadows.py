@@ -4,13 +4,15 @@
 
 *Irradiance* is of all lights but the domes on what the eye sees directly; its error is the root mean square over the
 pixels in a penumbra (where the samples of the exact picture disagree), of the unshadowed irradiance there. Times are of
-one process, median of `--rounds`, CPU time of all threads; the domes' rows the same with `dome_shadows=on`.
+one process, median of `--rounds`, CPU time of all threads; the rows below with `shadow_sharing=on` instead of `off`, and the
+domes' the same with `dome_shadows=on`.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import replace
 
 import numpy as np
 
@@ -36,8 +38,8 @@ def main() -> None:
     points = direct.points_of(scene, gbuffer, None, arguments.threads)
     seen = gbuffer.triangle.numpy() >= 0
 
-    def irradiance(samples: int) -> np.ndarray:
-        cast = shadows.every_shadow(scene, samples)
+    def irradiance(samples: int, shared: bool = False) -> np.ndarray:
+        cast = replace(shadows.every_shadow(scene, samples), shared=shared)
         return shadows.shadowed_irradiance(scene, points, cast, arguments.threads).numpy()[seen].mean(axis=1)
 
     def sky(samples: int) -> np.ndarray:
@@ -52,6 +54,8 @@ def main() -> None:
         part = (exact > 0.02 * unshadowed) & (exact < 0.98 * unshadowed)
         print(f"lights: {part.mean():.1%} of the points partly shadowed")
         report(irradiance, exact, part, unshadowed, arguments.rounds)
+        print("lights, neighbours share what their rays find")
+        report(lambda samples: irradiance(samples, True), exact, part, unshadowed, arguments.rounds)
     exact = sky(EXACT)
     print("domes")
     report(sky, exact, np.full(len(exact), True), np.ones(len(exact)), arguments.rounds)

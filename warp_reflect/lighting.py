@@ -18,9 +18,9 @@ from warp_reflect.shadows import Shadows, first_count, light_shares, shared_coun
 
 REC709_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 PROBE_SAMPLES = 4  # rays to a shape from each point that is tried
-# All rays are sent where the first ones of 3 x 3 pixels part; the points tried tell where `PROBE_SAMPLES` do. Where any share of
+# More rays are sent where the first ones of 5 x 5 pixels part; the points tried tell where `PROBE_SAMPLES` do. Where any share of
 # a shape is as likely to be seen, n rays part with probability 1 - 2 / (n + 1).
-MORE_PARTED = (1.0 - 2.0 / (9.0 + 1.0)) / (1.0 - 2.0 / (PROBE_SAMPLES + 1.0))
+MORE_PARTED = (1.0 - 2.0 / (25.0 + 1.0)) / (1.0 - 2.0 / (PROBE_SAMPLES + 1.0))
 # Of the visible share of a shape in its penumbra, root mean square, times samples^-3/4 (`tools/bench_shadows.py`).
 PENUMBRA_ERROR = 0.4
 
