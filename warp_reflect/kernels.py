@@ -63,7 +63,7 @@ def of_view(settings: Settings, device: wp.DeviceLike, casting: bool = False, mi
     if mirrors:
         asked += ["surface"]
     if casting:
-        asked += ["direct", "|shadows_vector", "-shadows/tried"]
+        asked += ["direct", "shadow_starts", "|shadows_vector", "-shadows/tried"]
     return _of(asked, vectors(settings, device))
 
 
@@ -80,7 +80,7 @@ def of_plan(plan: Plan) -> list[str]:
     seen = [row for row in plan.rows if row.pixels > 0]
     if plan.shadows is not None and plan.shadows.direct and plan.scene.triangle_count:
         cut = plan.scene.has_hole is not None
-        asked += ["direct", *(["cut_shadows"] if cut else ["|shadows_vector", "-shadows/plain"])]
+        asked += ["direct", *(["cut_shadows"] if cut else ["shadow_starts", "|shadows_vector", "-shadows/plain"])]
     if seen:
         asked += ["surface", "|surface_vector", "-surface/plain", "shade"]
     for row in seen:
