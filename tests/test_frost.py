@@ -96,6 +96,21 @@ def test_frost_blurs_as_the_mean_of_the_rays_does():
     np.testing.assert_array_equal(blurred["RGBA"][~inner], averaged["RGBA"][~inner])
 
 
+def test_rays_tell_what_cones_see_past_the_pane():
+    """A pane half as wide as its cones: at most half as far off as the blurred picture alone, the same at any threads."""
+    pane, world = upright(1.0, 0.5)
+    things = [(pane, world, frosted(20.0)), *balls()]
+    asked = [{"frost_rays": 0}, {"threads": 1}, {"threads": 2}, {"frost_samples": 128}]
+    alone, corrected, again, averaged = (frame(stage(*things), (160, 90), **settings) for settings in asked)
+    inner = averaged["primId"] == 2
+    assert inner.sum() > 300
+    error, of_alone = (np.abs(each["RGBA"] - averaged["RGBA"])[inner].mean() for each in (corrected, alone))
+    assert error < 0.5 * of_alone, (error, of_alone)
+    np.testing.assert_array_equal(corrected["RGBA"], again["RGBA"])
+    assert "(frost_rays)" in corrected.plan.panes[0].effects["frost"].reason
+    assert "(frost_rays)" not in alone.plan.panes[0].effects["frost"].reason
+
+
 @pytest.mark.parametrize("samples", [0, 32])
 def test_frost_grows_with_distance_behind_the_pane(samples):
     """A black wall's edge against the sky, near the pane and far behind it: widths of the edges are their cones'."""

@@ -4,8 +4,9 @@
     python tools/bench_water.py --json
 
 `usd_scenes/pool.usda`: the water as an opaque flat mirror (planar), still and clear, with waves looked up, with waves traced
-(the reference of the row before). `usd_scenes/frosted_window.usda`: clear panes, frost blurred, frost of so many rays (the
-last is the reference). Times are CPU milliseconds of a whole frame, the median of the frames after the first; errors are
+(the reference of the row before). `usd_scenes/frosted_window.usda`: clear panes, frost blurred without and with the rays that
+correct it, frost of so many rays (the last is the reference).
+Times are CPU milliseconds of a whole frame, the median of the frames after the first; errors are
 over the pixels of the water or the panes: the mean absolute difference of radiance and, where flip-evaluator is installed,
 the mean FLIP. Shadows are off: they cost the same in every row.
 """
@@ -109,6 +110,7 @@ def main() -> int:
     }
     panes = {
         "clear": (window, {"frost_px": 1.0e6}),
+        "frost, no rays": (window, {"frost_rays": 0}),
         "frost, blurred": (window, {}),
         **{f"frost, {rays} rays": (window, {"frost_samples": rays}) for rays in RAYS},
     }
@@ -117,7 +119,7 @@ def main() -> int:
     judge(tables["pool"], "waves, traced", ["still water", "waves, lookup"], ("/World/Water",))
     tables["frosted_window"] = measure(panes, size, 1, args.threads, args.method)
     frosted = ("/World/Panes/Frosted", "/World/Panes/Misted")
-    judged = ["clear", "frost, blurred", *(f"frost, {rays} rays" for rays in RAYS[:-1])]
+    judged = ["clear", "frost, no rays", "frost, blurred", *(f"frost, {rays} rays" for rays in RAYS[:-1])]
     judge(tables["frosted_window"], f"frost, {RAYS[-1]} rays", judged, frosted)
     for name, rows in tables.items():
         if not args.json:

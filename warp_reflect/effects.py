@@ -230,6 +230,8 @@ def _frost(material: MaterialData, finish: FinishData, settings: Settings, camer
     if radius <= settings.frost_px:
         return Effect(False, f"{asked}, <= {settings.frost_px:g} (frost_px)", numbers)
     how = f"{settings.frost_samples} rays a pixel" if settings.frost_samples else "the picture behind it is blurred"
+    if settings.frost_rays and not settings.frost_samples:
+        how = f"{how} and corrected by {settings.frost_rays} rays a pixel (frost_rays)"
     return Effect(True, f"{asked}, > {settings.frost_px:g} (frost_px); {how} (frost_samples)", numbers)
 
 

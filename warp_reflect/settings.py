@@ -182,6 +182,8 @@ class Settings:
     """Frost that blurs even what is infinitely far by less than this is left out. [pixels]"""
     frost_samples: int = 0
     """Frosted surfaces: 0 blurs the picture of what is behind them, else so many rays a pixel are averaged, the reference."""
+    frost_rays: int = 3
+    """Rays a pixel that say what blurred frost lacks, as what its cone sees past the surface's outline; 0: it lacks it."""
     frost_distance: float = 0.0
     """What is seen through transparent surfaces fades over this distance to 1/e, where the stage asks for no fade; 0: it does
     not. [scene units]"""
@@ -299,6 +301,7 @@ class Settings:
         _require(0.0 <= self.frost <= 45.0, "frost", self.frost, "0 to 45 degrees")
         _require(0.0 <= self.frost_px <= 1.0e6, "frost_px", self.frost_px, "0 to 1000000 pixels")
         _require(0 <= self.frost_samples <= 65536, "frost_samples", self.frost_samples, "0 (blurred) to 65536 rays")
+        _require(0 <= self.frost_rays <= 256, "frost_rays", self.frost_rays, "0 (blurred alone) to 256")
         _require(self.waves in WAVES, "waves", self.waves, f"one of {', '.join(WAVES)}")
         _require(0 <= self.walk_hops <= 64, "walk_hops", self.walk_hops, "0 to 64")
         _require(self.field_kind in FIELDS, "field_kind", self.field_kind, f"one of {', '.join(FIELDS)}")

@@ -5,12 +5,15 @@ jittered pictures of Diefenbach and Badler, Multi-Pass Pipeline Rendering, I3D 1
 edition, section 9.3.1. 0 looks the cone's directions up in the picture of what one would see through clear glass, as the
 faster way there does. Differs from it by: the picture is divided by distance into octaves of the cone's radius, each of which is
 blurred by its own and laid over what is behind it, so that what touches the glass stays sharp before a blurred background.
+What that picture lacks, above all what a cone sees past the surface's own outline, a few rays of every pixel know
+(`frost_rays`): by what they see on average beside it in the pixels around one, the blurred picture is corrected.
 """
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
 import warp as wp
 
 from warp_reflect import launch
@@ -30,6 +33,8 @@ wp.set_module_options({"enable_backward": False})
 LOOK_UPS = 12  # of an octave
 OCTAVES = wp.constant(7)  # of the cone's radius; what is nearer than the last is blurred as that
 SHARPEST = wp.constant(0.5)  # pixels: a smaller disc is the pixel itself
+# Of the cone's radius, over which the correction by rays is the mean: a few hundred pixels leave little grain of wide cones.
+CORRECTED = 0.25
 LEAST_COVERAGE = wp.constant(1.0e-3)  # of a cone: below it there is nothing to mix
 
 
@@ -134,12 +139,60 @@ def mean_kernel(first: int, count: int, radiance: wp.array(dtype=wp.vec3), out_r
     out_radiance[i] += radiance[i] / float(count)
 
 
+@wp.kernel
+def missed_kernel(
+    first: int,
+    camera: CameraView,
+    pixel: wp.array(dtype=int),
+    blurry: wp.array(dtype=wp.vec3),
+    rays: wp.array(dtype=wp.vec3),
+    out_pyramid: Pyramid,
+):
+    """One thread per pixel: what its rays see beside the blurred picture."""
+    i = first + wp.tid()
+    missed = rays[i] - blurry[i]
+    out_pyramid.color[texel_of(out_pyramid, pixel[i], camera.width)] = wp.vec4(missed[0], missed[1], missed[2], 1.0)
+
+
+@wp.kernel
+def correct_kernel(
+    first: int,
+    camera: CameraView,
+    missed: Pyramid,
+    pixel: wp.array(dtype=int),
+    blurry: wp.array(dtype=wp.vec3),
+    radius: float,
+    count: int,
+    brightest: wp.vec3,
+    out_radiance: wp.array(dtype=wp.vec3),
+):
+    """One thread per pixel: adds the mean of what is missed over a disc around it, between black and the brightest."""
+    i = first + wp.tid()
+    row = pixel[i] // camera.width
+    x = float(pixel[i] - row * camera.width - missed.x0) + 0.5
+    y = float(row - missed.y0) + 0.5
+    level = level_of(missed, radius * wp.sqrt(3.0 / float(count)))
+    total = look_up_level(missed, 0, x, y, level)
+    for k in range(count // 2):
+        disc = radius * disc_sample(0, k, count // 2)
+        total += look_up_level(missed, 0, x + disc[0], y + disc[1], level)
+        total += look_up_level(missed, 0, x - disc[0], y - disc[1], level)
+    out_radiance[i] = blurry[i]
+    if total[3] > LEAST_COVERAGE:
+        corrected = blurry[i] + wp.vec3(total[0], total[1], total[2]) / total[3]
+        out_radiance[i] = wp.min(wp.max(corrected, wp.vec3(0.0, 0.0, 0.0)), brightest)
+
+
 def apply_through(scene: Scene, through: Through, found: Transmission, radiance: wp.array, pane) -> wp.array:
     """What a frosted surface's pixels see behind it, see `finishes`."""
     samples = pane.settings.frost_samples
     if samples:
         return accumulated(scene, through, found, pane, samples)
-    return blurred(scene, through, found, radiance, pane)
+    blurry = blurred(scene, through, found, radiance, pane)
+    if not pane.settings.frost_rays:
+        return blurry
+    rays = accumulated(scene, through, found, pane, pane.settings.frost_rays)
+    return corrected(scene, through, found, blurry, rays, pane)
 
 
 def accumulated(scene: Scene, through: Through, found: Transmission, pane, samples: int) -> wp.array:
@@ -167,3 +220,19 @@ def blurred(scene: Scene, through: Through, found: Transmission, radiance: wp.ar
     inputs = [view, pyramid, pixels.pixel, pixels.point, radiance, spread_px, LOOK_UPS, blurry]
     launch.launch(frost_kernel, pixels.count, inputs, device, threads)
     return blurry
+
+
+def corrected(scene: Scene, through: Through, found: Transmission, blurry: wp.array, rays: wp.array, pane) -> wp.array:
+    """The blurred picture with what it lacks on average beside a few rays a pixel."""
+    pixels, threads, device = found.layer.pixels, pane.settings.threads, scene.device
+    view = through.shown.gbuffer.view
+    radius = CORRECTED * pane.effects["frost"].numbers["radius_px"]
+    missed = empty_pyramid(pixels, device, 1, max(int(math.log2(max(radius, 1.0))) + 1, 1))
+    launch.launch(missed_kernel, pixels.count, [view, pixels.pixel, blurry, rays, missed], device, threads)
+    halve(missed, 1, device, threads)
+    # Nothing sends out more than there is to be seen.
+    brightest = wp.vec3(*np.maximum(blurry.numpy().max(axis=0), rays.numpy().max(axis=0)).tolist())
+    radiance = wp.empty(pixels.count, dtype=wp.vec3, device=device)
+    inputs = [view, missed, pixels.pixel, blurry, radius, LOOK_UPS, brightest, radiance]
+    launch.launch(correct_kernel, pixels.count, inputs, device, threads)
+    return radiance
