@@ -16,6 +16,7 @@ import pytest
 import warp_reflect as wr
 from warp_reflect import cli, sweep, sweep_report
 from warp_reflect.realised import as_points
+from warp_reflect.scene import Scene
 from warp_reflect.settings import Settings
 from warp_reflect.techniques import TECHNIQUES
 
@@ -90,6 +91,21 @@ def test_contenders_cover_the_settings_of_maps(scene):
     assert {each.rem_count for each in settings} >= set(sweep.REM_COUNTS)
     assert {each.rem_limit for each in settings} >= set(sweep.REM_LIMITS)
     assert {each.parallax_steps for each in settings} >= set(sweep.PARALLAX_STEPS)
+
+
+def test_contenders_cover_the_cells_of_fields_where_mirrors_move(scene):
+    def cells(of):
+        every, _ = sweep.default_contenders(of, None, SIZE)
+        return sorted(each.settings.field_cell for each in every if each.settings.local_rays == "field")
+
+    assert not cells(scene), "this mirror stands still"
+    (part,) = {row.reflector.part for row in wr.make_plan(scene, size=SIZE).rows}
+    prim = scene.parts[part].prim - 1
+    instances = [dataclasses.replace(each, moves=k == prim) for k, each in enumerate(scene.data.instances)]
+    moving = Scene(dataclasses.replace(scene.data, instances=instances), str(scene.device))
+    found = cells(moving)
+    assert found[0] == 0.0 and len(found) == 1 + len(sweep.FIELD_CELLS)
+    assert np.allclose(sorted(scene.size / np.array(found[1:])), sweep.FIELD_CELLS, rtol=0.06)
 
 
 def test_choosing_refuses_a_name_that_fits_nothing(scene):

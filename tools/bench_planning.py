@@ -1,6 +1,7 @@
 """What planning costs: once for many prims, in every later frame, and a frame of a stage without mirrors beside one told so.
 
     python tools/bench_planning.py
+    python tools/bench_planning.py --foretold usd_scenes/*.usda
     python tools/bench_planning.py --prims 2000 --mirrors 20 --stage usd_scenes/toy_room.usda --size 640x360
 
 *Once*: the first plan of a scene of balls, some of them mirrors; kernels are loaded, nothing is known of the scene. *Later*: the
@@ -12,6 +13,7 @@ reflections (`--method none`), in turn. CPU time of one thread, medians.
 from __future__ import annotations
 
 import argparse
+import itertools
 import statistics
 import time
 from collections.abc import Callable
@@ -130,6 +132,21 @@ def without_mirrors(size: tuple[int, int], frames: int) -> tuple[float, float]:
     return tuple(statistics.median(found[2:]) for found in times.values())
 
 
+def foretold(stages: list[str], widths: list[int]) -> None:
+    """Print what first frames were predicted to take beside what they took, after one that loaded kernels."""
+    print("| stage | size | predicted ms | realised | ratio |\n|---|---|--:|--:|--:|")
+    for stage, width in itertools.product(stages, widths):
+        scene, size = wr.load_stage(stage), (width, width * 9 // 16)
+        asked = {"size": size, "settings": wr.Settings(threads=1)}
+        wr.render_frame(scene, wr.make_plan(scene, **asked))
+        frame = wr.render_frame(scene, wr.make_plan(scene, **asked))
+        ratio = frame.expected_ms / frame.spent_ms
+        print(
+            f"| {stage} | {width}x{size[1]} | {frame.expected_ms:.0f} | {frame.spent_ms:.0f} | {ratio:.2f} |",
+            flush=True,
+        )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--prims", type=int, default=500)
@@ -137,9 +154,17 @@ def main() -> None:
     parser.add_argument("--stage", nargs="*", default=["usd_scenes/kitchen.usda", "usd_scenes/toy_room.usda"])
     parser.add_argument("--size", default="960x540")
     parser.add_argument("--frames", type=int, default=9)
+    parser.add_argument(
+        "--foretold", nargs="+", metavar="STAGE", help="instead: first frames, predicted beside realised"
+    )
+    parser.add_argument("--widths", type=int, nargs="+", default=[160, 320, 640], help="of these")
     arguments = parser.parse_args()
     size = tuple(int(side) for side in arguments.size.split("x"))
     devices.open_device("cpu")
+    if arguments.foretold:
+        with counted_by(time.thread_time):
+            foretold(arguments.foretold, arguments.widths)
+        return
     with counted_by(time.thread_time):
         ms, ready = once(arguments.prims, arguments.mirrors, size, 3)
         print(

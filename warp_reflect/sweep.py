@@ -53,6 +53,7 @@ ENVIRONMENT_RESOLUTIONS = (32, 64, 128, 256, 512)
 REM_COUNTS = (1, 2, 3, 4)
 REM_LIMITS = (1, 4, 16)
 PARALLAX_STEPS = (0, 4, 12, 24)
+FIELD_CELLS = (64, 128, 256)  # in the scene's size
 # Which techniques hear of a knob; those that are not there are left out.
 FORWARD = ("planar", "quadric", "reflector_map", "explosion_map")
 SEARCHED = ("reflector_map",)
@@ -264,6 +265,11 @@ def default_contenders(
     for knob, values in (("rem_count", REM_COUNTS), ("rem_limit", REM_LIMITS), ("parallax_steps", PARALLAX_STEPS)):
         for value in values:
             add("layered_environment", **{knob: value})
+    mirrors = {row.reflector.part for row in make_plan(scene, camera, size, base).rows if row.pixels}
+    if mirrors & set(scene.moving_parts):  # a field holds what never moves
+        add("layered_environment", local_rays="field")
+        for cells in FIELD_CELLS:
+            add("layered_environment", local_rays="field", field_cell=float(f"{scene.size / cells:.2g}"))
     seen: dict[tuple, Contender] = {}
     for each in found:
         seen.setdefault((each.method, each.settings, each.warm), each)
