@@ -112,6 +112,10 @@ def pytest_collection_finish(session: pytest.Session) -> None:
     gc.freeze()
 
 
+def pytest_unconfigure() -> None:
+    gc.unfreeze()  # libraries tell of what is left at the end of the process
+
+
 def _kernels() -> set[str]:
     """The names of all kernels of the package, as `launch.recorded` gives them."""
     package = Path(warp_reflect.__file__).parent
