@@ -228,9 +228,7 @@ def plot(cells: list[dict], path: Path, title: str) -> None:
         panel.set_yticks(range(len(counts)), [f"{count:,d}" for count in counts])
         panel.set_xlabel("mirror pixels")
         panel.set_ylabel("triangles")
-        panel.set_title(
-            f"{name}: tracing takes so many times as long (line: equal; planner: F forward, T traces)", fontsize=9
-        )
+        panel.set_title(name)
     figure.colorbar(drawn, ax=panels[1], label="log2 (tracing / forward)")
     for name, mark in ((TRACED, "o"), (FORWARD, "^")):
         panels[2].loglog(
@@ -241,7 +239,12 @@ def plot(cells: list[dict], path: Path, title: str) -> None:
     panels[2].set_xlabel("measured ms")
     panels[2].set_ylabel("predicted ms")
     panels[2].legend()
-    figure.suptitle(title)
+    panels[2].set_title("predicted against measured")
+    figure.suptitle(
+        "Tracing takes so many times as long as forward projection (line: equal). The planner takes F forward, T tracing.\n"
+        f"{title}",
+        fontsize=10,
+    )
     written = path.with_name(f".{path.name}")
     figure.savefig(written, dpi=110, format="png")
     pyplot.close(figure)
