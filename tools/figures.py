@@ -162,6 +162,12 @@ FIGURES = {
             "FLIP": number("flip", 3),
         },
     ),
+    "planning": Figure(
+        "Planning",
+        "bench_planning.py",
+        (),
+        ("--prims", "20", "--mirrors", "2", "--size", "64x36", "--frames", "1"),
+    ),
 }
 
 
