@@ -50,10 +50,12 @@ def planned(scene, method="auto", earlier=None, costs=None, **settings):
 # The arithmetic, with costs of one microsecond each.
 
 
-def test_traced_pixels_cost_their_rays_by_the_logarithm_of_the_triangles():
-    assert predict(WORK, "raytraced", Settings(), ONES)["ms"] == pytest.approx(1.001)
-    few = dataclasses.replace(WORK, scene_triangles=256)
-    assert predict(few, "raytraced", Settings(), ONES)["ms"] == pytest.approx(0.501)
+def test_traced_pixels_cost_their_rays_by_the_logarithm_of_the_triangles_or_side_by_side():
+    plain, few = Settings(kernels="plain"), dataclasses.replace(WORK, scene_triangles=256)
+    assert predict(WORK, "raytraced", plain, ONES)["ms"] == pytest.approx(1.001)
+    assert predict(few, "raytraced", plain, ONES)["ms"] == pytest.approx(0.501)
+    assert predict(few, "raytraced", Settings(), ONES)["ms"] == pytest.approx(0.001 + 0.25 + 0.47 * 0.256**0.5)
+    assert predict(WORK, "raytraced", Settings(), ONES)["ms"] == pytest.approx(3.001)  # as dear as they get
 
 
 def test_planar_mirror_costs_a_vertex_a_triangle_and_a_pixel():
@@ -421,17 +423,20 @@ def test_rays_behind_panes_are_about_those_predicted(glass, device):
 def test_shadow_rays_are_about_those_predicted(device):
     lamp = LightData("/lamp", "sphere", (9.0, 9.0, 9.0), placed(1.0, 3.0, 1.0), size=(0.8,))
     scene = Scene(changed(MaterialData(), [lamp]), device)
-    plan = planned(scene, "none", shadow_min_share=0.0)
+    plan = planned(scene, "none", shadow_min_share=0.0, shadow_sharing="off")
     numbers = plan.lights[0].effects["shadows"].numbers
+    shared = planned(scene, "none", shadow_min_share=0.0).lights[0].effects["shadows"].numbers
     frame = wr.render_frame(scene, plan)
-    # All samples are sent where a first ray of the 3 x 3 pixels around finds another thing.
+    # All samples are sent where a first ray of the 5 x 5 pixels around finds another thing.
     _, unshadowed, free = light_shares(scene, direct.points_of(scene, frame.gbuffer), 1)
     lit = unshadowed[:, 0].sum(axis=1) > 0.0
     image = np.where(lit, free[:, 0], np.nan).reshape(SIZE[1], SIZE[0])
-    around = np.stack([np.roll(image, (y, x), (0, 1)) for y in (-1, 0, 1) for x in (-1, 0, 1)])
-    parted = (np.nanmax(around, axis=0, initial=0.0) > np.nanmin(around, axis=0, initial=1.0)).ravel() & lit
+    bordered = np.pad(image, 2, constant_values=np.nan)
+    around = np.lib.stride_tricks.sliding_window_view(bordered, (5, 5)).reshape(*image.shape, 25)
+    parted = (np.nanmax(around, axis=-1, initial=0.0) > np.nanmin(around, axis=-1, initial=1.0)).ravel() & lit
     assert parted.sum() > 200
     samples = plan.settings.shadow_samples
     asked = lit.sum() * first_count(samples) + parted.sum() * samples
     assert asked / 1.3 <= numbers["rays"] <= 1.3 * asked, (asked, numbers)
+    assert lit.sum() * first_count(samples) < shared["rays"] < numbers["rays"]
     assert parted.sum() / 1.3 <= numbers["penumbra"] * numbers["lit"] * numbers["points"] <= 1.3 * parted.sum()

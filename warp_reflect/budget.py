@@ -21,16 +21,16 @@ class Costs:
     """
 
     trace: float = 0.5
-    """A reflected ray through a BVH of `TRACE_BASE` triangles; grows with their logarithm."""
-    mirrored: float = 0.12
+    """A ray for itself through a BVH of `TRACE_BASE` triangles; grows with their logarithm. Of a mirror's own: see `packed`."""
+    mirrored: float = 0.17
     """A vertex mirrored in a plane."""
     quadric_cold: float = 0.18
     """A vertex solved on a quadric, from nothing, boxes and the rest of a search's step included."""
-    quadric_warm: float = 0.1
+    quadric_warm: float = 0.13
     """The same from the last frame's answer."""
     map_cold: float = 0.19
     """A vertex solved in a map, from nothing."""
-    map_warm: float = 0.15
+    map_warm: float = 0.19
     """The same from the last frame's answer."""
     branches: float = 8.0
     """A vertex whose every reflection point on a concave side is searched."""
@@ -38,9 +38,9 @@ class Costs:
     """A vertex whose edges are looked at, whether they bend, on a frame that cuts anew."""
     cut: float = 0.55
     """A virtual vertex added where they do."""
-    draw: float = 0.065
+    draw: float = 0.09
     """A virtual triangle, the clipping at the hidden boundary included."""
-    covered: float = 0.12
+    covered: float = 0.02
     """A mirror pixel that virtual triangles are drawn into, those included that others hide."""
     interpolated: float = 0.55
     """A vertex interpolated from a grid."""
@@ -73,7 +73,7 @@ class Costs:
     shadow: float = 0.5
     """A ray towards a light through `TRACE_BASE` triangles, that only asks whether anything is in the way, the rest of
     shadowing included."""
-    layer: float = 400.0
+    layer: float = 850.0
     """A reflector: what does not depend on counts."""
     sharing: float = 0.85
     """Of a further thread, how much it adds to the first."""
@@ -81,6 +81,10 @@ class Costs:
 
 BUILT_IN = Costs()
 TRACE_BASE = 65536  # triangles at which `Costs.trace` is told
+# A mirror's own rays go through the tree side by side, the cheaper the more of them meet the same triangles: at least this
+# share of `Costs.trace`, and more by the root of triangles per mirror pixel. Measured by `tools/bench_crossing.py`, 10^4 to 10^6
+# triangles by 10^3 to 10^6 pixels; beyond the last factor fixed costs hide the rest.
+PACKED_LEAST, PACKED_ROOT, PACKED_MOST = 0.25, 0.47, 3.0
 # Rays of a pixel of a rough mirror that are followed, by `effects.glossy_way`: `SAMPLES` of `finishes.glossy_gather` and of
 # `glossy_rays`, whose import would build Warp's modules before they are asked for.
 GLOSSY_RAYS = {"gather": 6, "accumulate": 256, "filter": 0, "prefiltered": 0, "off": 0}
@@ -230,6 +234,16 @@ def ray_us(triangles: int, costs: Costs = BUILT_IN) -> float:
     return costs.trace * math.log2(max(triangles, 2)) / math.log2(TRACE_BASE)
 
 
+def packed(triangles: int, pixels: int) -> float:
+    """What a mirror's own ray costs with vector kernels, over `Costs.trace`.
+
+    Args:
+        triangles: Of the scene.
+        pixels: Of the mirror.
+    """
+    return min(PACKED_LEAST + PACKED_ROOT * math.sqrt(triangles / pixels), PACKED_MOST)
+
+
 def shadow_ray_ms(triangles: int, costs: Costs = BUILT_IN, threads: int = 1) -> float:
     """Milliseconds of a ray towards a light in a scene of so many triangles."""
     deep = math.log2(max(triangles, 2)) / math.log2(TRACE_BASE)
@@ -264,6 +278,8 @@ def _microseconds(work: Work, technique: str, settings: Settings, costs: Costs) 
     """(of a frame that follows another, of one that starts from nothing) on one thread."""
     ray = ray_us(work.scene_triangles, costs)
     if technique == "raytraced":
+        if settings.kernels != "plain":
+            ray = costs.trace * packed(work.scene_triangles, work.pixels)
         return (costs.layer + work.pixels * ray,) * 2
     if technique == "environment":
         drawn = _texels(technique, settings) * costs.map_texel + 6 * work.scene_triangles * costs.map_triangle

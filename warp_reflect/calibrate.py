@@ -17,7 +17,7 @@ from collections.abc import Callable
 import numpy as np
 import warp as wp
 
-from warp_reflect.budget import BUILT_IN, GLOSSY_RAYS, TRACE_BASE, Costs
+from warp_reflect.budget import BUILT_IN, GLOSSY_RAYS, TRACE_BASE, Costs, packed
 from warp_reflect.frame import Frame, render_frame
 from warp_reflect.launch import thread_count
 from warp_reflect.planner import Plan, make_plan
@@ -73,7 +73,7 @@ def _measure(device: str, repeats: int, told: Callable[[str], None]) -> Costs:
     told("rays")
     traced = _timed(ball, "reference", repeats)
     ray = traced.us("reflect") / traced.pixels
-    found["trace"] = ray * math.log2(TRACE_BASE) / math.log2(ball.triangle_count)
+    found["trace"] = ray / packed(ball.triangle_count, traced.pixels)
     few = _timed(ball, "reference", repeats, size=(16, 9))
     found["layer"] = max(few.us("reflect") - few.pixels * ray, 1.0)
     told("quadrics and maps")

@@ -127,6 +127,7 @@ class Plan:
     _prepared: dict[int, object] = field(default_factory=dict)
     _prepared_in_mirrors: dict[tuple[int, str], object] = field(default_factory=dict)
     _ways: dict[int, list[choice.Option]] = field(default_factory=dict)
+    _revised: bool = False  # rows were chosen otherwise than `make_plan` does: it is no answer to the same request
     _seen: EyeView | None = None  # what the plan's camera sees, drawn to decide: the first frame's
     _told: int = 0  # of the notes, the last: those of the request for an error or a time
 
@@ -421,6 +422,8 @@ def make_plan(
 def _asks_the_same(earlier: Plan, scene: Scene, view: Camera, settings: Settings, method: str, costs: Costs) -> bool:
     """Whether a plan is the answer again: the same request of the same world from the same eye, and no time was asked for."""
     asked = settings, method, costs
+    if earlier._revised:
+        return False
     still = earlier.scene.shares_world(scene) and earlier.camera.sees_as(view)
     return still and (earlier.settings, earlier.method, earlier.costs) == asked and settings.budget_ms == 0.0
 
@@ -529,7 +532,7 @@ def prefer_forward(plan: Plan, earlier: Plan | None = None) -> Plan:
             reason = f"{reason}; for its virtual objects"
             row = dataclasses.replace(row, technique=name, reason=reason, predicted=predicted)
         rows.append(row)
-    made = dataclasses.replace(plan, rows=rows, _prepared={})
+    made = dataclasses.replace(plan, rows=rows, _prepared={}, _revised=True)
     _take_over(made, plan)
     _take_over(made, earlier)
     return made
@@ -553,7 +556,7 @@ def with_techniques(plan: Plan, techniques: Mapping[int, str]) -> Plan:
             else:
                 notes.append(Note(row.path, f"{name} does not apply ({reason})"))
         rows.append(row)
-    made = dataclasses.replace(plan, rows=rows, notes=notes, _prepared={})
+    made = dataclasses.replace(plan, rows=rows, notes=notes, _prepared={}, _revised=True)
     _take_over(made, plan)
     return made
 
