@@ -20,62 +20,62 @@ class Costs:
     `calibration.measure` finds them for another machine. Ratios between them decide, and those vary less.
     """
 
-    trace: float = 0.5
+    trace: float = 0.53
     """A ray for itself through a BVH of `TRACE_BASE` triangles; grows with their logarithm. Of a mirror's own: see `packed`."""
-    mirrored: float = 0.17
+    mirrored: float = 0.16
     """A vertex mirrored in a plane."""
-    quadric_cold: float = 0.18
+    quadric_cold: float = 0.22
     """A vertex solved on a quadric, from nothing, boxes and the rest of a search's step included."""
-    quadric_warm: float = 0.13
+    quadric_warm: float = 0.17
     """The same from the last frame's answer."""
-    map_cold: float = 0.19
+    map_cold: float = 0.25
     """A vertex solved in a map, from nothing."""
-    map_warm: float = 0.19
+    map_warm: float = 0.21
     """The same from the last frame's answer."""
-    branches: float = 8.0
+    branches: float = 7.0
     """A vertex whose every reflection point on a concave side is searched."""
-    bent: float = 0.05
+    bent: float = 0.07
     """A vertex whose edges are looked at, whether they bend, on a frame that cuts anew."""
-    cut: float = 0.55
+    cut: float = 0.66
     """A virtual vertex added where they do."""
-    draw: float = 0.09
+    draw: float = 0.083
     """A virtual triangle, the clipping at the hidden boundary included."""
-    covered: float = 0.02
+    covered: float = 0.11
     """A mirror pixel that virtual triangles are drawn into, those included that others hide."""
-    interpolated: float = 0.55
+    interpolated: float = 0.33
     """A vertex interpolated from a grid."""
-    candidate: float = 0.1
+    candidate: float = 0.12
     """A mirror pixel that shows its candidate, unrefined."""
     refined: float = 0.09
     """A mirror pixel whose candidate is tested."""
-    own_body: float = 0.4
+    own_body: float = 0.38
     """A pixel of a mirror that may see itself."""
-    looked_up: float = 0.08
+    looked_up: float = 0.083
     """A mirror pixel that is looked up in a map of its environment: one bilinear look-up in a cube."""
     map_texel: float = 0.12
     """A texel of an environment map that is drawn: its ray, its shading."""
-    map_triangle: float = 0.09
+    map_triangle: float = 0.05
     """A triangle of the scene, for every face of such a map."""
     blended: float = 0.13
     """A texel of a local map and one of its reference maps: the depth test, the look-up."""
-    followed: float = 0.7
+    followed: float = 1.0
     """A mirror pixel that is followed to what a local map holds, and looked up there."""
-    eye_triangle: float = 0.06
+    eye_triangle: float = 0.045
     """A triangle in the eye's own view."""
-    eye_pixel: float = 0.06
+    eye_pixel: float = 0.065
     """A pixel of the picture: drawn, its mirror found, shaded."""
-    mirror_pixel: float = 0.2
+    mirror_pixel: float = 0.32
     """A mirror pixel: its point and normal, and the shading of what it shows."""
-    gathered: float = 1.2
+    gathered: float = 1.25
     """A ray of a rough mirror's lobe, beyond following it and its shadows: drawn, shaded, shared with neighbours."""
-    through: float = 0.7
+    through: float = 0.4
     """A ray behind a transparent surface, beyond its shadows: bent, followed, shaded, added."""
-    shadow: float = 0.5
+    shadow: float = 0.25
     """A ray towards a light through `TRACE_BASE` triangles, that only asks whether anything is in the way, the rest of
     shadowing included."""
-    layer: float = 850.0
+    layer: float = 900.0
     """A reflector: what does not depend on counts."""
-    sharing: float = 0.85
+    sharing: float = 0.83
     """Of a further thread, how much it adds to the first."""
 
 
