@@ -291,7 +291,7 @@ def test_shared_rays_are_few_near_the_reference_and_leave_no_grain():
     truth = rendered(scene, (128, 72), glossy="accumulate", glossy_samples=128)
     rays = rendered(scene, (128, 72), glossy="accumulate", glossy_samples=4)
     smooth, shared, alone = (
-        rendered(scene, (128, 72), glossy_samples=4, **settings)
+        rendered(scene, (128, 72), glossy="gather", glossy_samples=4, **settings)
         for settings in ({}, {"glossy_smooth": 0.0}, {"glossy_smooth": 0.0, "glossy_neighbours": 0})
     )
     seen = truth["reflectorId"] > 0
