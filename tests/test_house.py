@@ -48,7 +48,7 @@ HOMES = {
     "matplotlib": ("sweep_report", "viewer"),
     "trimesh": ("stage", "techniques", "viewer", "bodies", "shapes"),
     "coacd": ("techniques", "stage"),
-    "dask": (),
+    "dask": ("cluster",),
     "distributed": ("cluster",),
     "scipy": (),
     "embreex": ("sweep",),
