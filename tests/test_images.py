@@ -189,6 +189,14 @@ def test_pictures_beyond_the_limits_are_refused_quickly(tmp_path):
     assert images.read_image(wide).rgb.shape == (600, 600, 3)
 
 
+def test_size_is_counted_in_floats_too(tmp_path):
+    """One-bit grey is small as stored and large as three floats."""
+    grey = save(tmp_path / "a.tif", ["Y"], np.zeros((900, 1000, 1)), "uint8")
+    with pytest.raises(OSError, match=r"a\.tif: cannot be read: 1000 x 900 texels are 11 MB as numbers, at most 4 MB"):
+        images.read_image(grey, size_limit_mb=1)
+    assert images.read_image(grey, size_limit_mb=3).rgb.shape == (900, 1000, 3)
+
+
 def test_what_is_no_file_is_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"none\.png: cannot be read: no such file"):
         images.read_image(tmp_path / "none.png")

@@ -22,6 +22,7 @@ FORMATS = {".exr": "openexr", ".png": "png"}  # JPEG is left out: its writer end
 COLOR_CHANNELS = frozenset({"R", "G", "B", "A", "RGB", "RGBA", "reflection"})  # half in an EXR
 HALF_MAX = 65504.0  # largest finite half
 SIZE_LIMIT_MB = 512  # decoded size above which a picture is refused: a 1 MB file can ask for 4 GB
+FLOATS_PER_STORED = 4  # bytes of a float for one of a sample of 8 bits: such a picture of three colours may be as large
 FRAME_LIMIT_MB = 8192  # the same for our own frames: 8K with every channel
 SIDE_LIMIT = 32768  # pixels
 # Rows that are put together and handed over at once, for each thread of the writer: one ZIP block of an EXR. More would be
@@ -288,7 +289,7 @@ def read_image(
         color_space: "auto", "sRGB" or "raw", as UsdUVTexture's `sourceColorSpace`: auto decodes 8-bit
             pictures of 3 or 4 channels as sRGB, and converts float pictures that declare other primaries
             (ACEScg ...) to Rec.709.
-        size_limit_mb: Decoded size above which the file is refused. [MB]
+        size_limit_mb: Decoded size above which the file is refused; as floats, four times that. [MB]
         signed: Keep negative samples: directions, not light.
 
     Raises:
@@ -501,6 +502,13 @@ def _parts(path: Path, size_limit_mb: int) -> Iterator[tuple]:
             reader.geterror()  # that there is no further part is no fault
             break
         spec = reader.spec()
+        # The library's own limit counts samples as stored: one-bit grey becomes 96 bits of colour a texel here.
+        megabytes = spec.width * spec.height * max(spec.nchannels, 3) * 4 / 1e6
+        if megabytes > FLOATS_PER_STORED * size_limit_mb:
+            raise OSError(
+                f"{path}: cannot be read: {spec.width} x {spec.height} texels are {megabytes:,.0f} MB as numbers, "
+                f"at most {FLOATS_PER_STORED * size_limit_mb:,} MB are read; make it smaller"
+            )
         pixels = reader.read_image(number, 0, 0, spec.nchannels, oiio.FLOAT)
         # A cut JPEG and a bad EXR chunk "succeed"; only the text says that the rest is grey.
         message = reader.geterror()

@@ -1,9 +1,9 @@
 """Reads hostile stages in forked children of one warm process: `python forked_intake.py CASES.json OUTCOMES.json`.
 
 A child runs what a child of `read_untrusted` runs (`warp_reflect.stage.child`) under the same memory limit, or, for a
-case with a `command`, the `main` of the command line; both under an alarm. The parent has imported everything and
-started neither Warp nor a thread. Its own process, so that a test run with Warp, threads and open files is never
-forked.
+case with a `command`, the `main` of the command line; both with a limit of computing time and under an alarm. The
+parent has imported everything and started neither Warp nor a thread. Its own process, so that a test run with Warp,
+threads and open files is never forked.
 """
 
 from __future__ import annotations
@@ -22,8 +22,9 @@ from pathlib import Path
 
 import numpy as np
 
-SECONDS = 20
-COMMAND_SECONDS = 300  # kernels may have to be compiled
+SECONDS = 20  # of computing
+COMMAND_SECONDS = 300  # of computing: kernels may have to be compiled
+STUCK = 15  # times that by the clock: a busy machine may take long over what a child computes, but nothing may wait for ever
 MEMORY_BYTES = 4 * 2**30
 OUTPUT_BYTES = 512 * 2**20  # what a child may write into one file
 
@@ -77,7 +78,9 @@ def outcome(case: dict) -> dict:
                 os.dup2(os.open(f"{folder}/{name}", os.O_WRONLY | os.O_CREAT), number)
             resource.setrlimit(resource.RLIMIT_FSIZE, (OUTPUT_BYTES, OUTPUT_BYTES))
             command = "command" in case
-            signal.alarm(COMMAND_SECONDS if command else SECONDS)
+            seconds = COMMAND_SECONDS if command else SECONDS
+            resource.setrlimit(resource.RLIMIT_CPU, (seconds, resource.RLIM_INFINITY))
+            signal.alarm(STUCK * seconds)
             result = run_command(case) if command else read_case(case, Path(folder))
             answer.write_text(json.dumps(result))
             code = 0

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections import Counter
@@ -20,7 +21,7 @@ from hostile import CRASH, NOTED, READ, REFUSED
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
 MUTANTS = int(os.environ.get("WARP_REFLECT_HOSTILE", "20"))
-SIGNAL_ALARM = 14
+HANGING = (int(signal.SIGXCPU), int(signal.SIGALRM))
 # What the image library itself prints of a bad PNG, beside what it reports.
 FOREIGN = ("libpng ",)
 # Families whose files may kill a process or name what lies outside: these are for --untrusted.
@@ -83,7 +84,7 @@ def fault(outcome: dict) -> str:
     kind, expect = outcome["kind"], outcome["expect"]
     if kind == "died":
         # The library died in a process of its own, which is what that is for; but nothing may hang.
-        return "" if expect == CRASH and outcome["signal"] != SIGNAL_ALARM else f"died of signal {outcome['signal']}"
+        return "" if expect == CRASH and outcome["signal"] not in HANGING else f"died of signal {outcome['signal']}"
     if kind == "raised":
         return f"raised {outcome['stderr'][-500:]}"
     if "Traceback" in outcome["stderr"] or "RuntimeWarning" in outcome["stderr"]:
