@@ -19,7 +19,7 @@ from warp_reflect.cubemap import RADIANCE_AXES, texel_directions
 from warp_reflect.environment_maps import CubeMapsView
 from warp_reflect.scene import EnvironmentMapData, InstanceData, LightData, MaterialData, Scene
 from warp_reflect.shadows import asked_shadows
-from warp_reflect.techniques import local_map, local_mesh, reference_maps
+from warp_reflect.techniques import local_map, local_mesh, local_shading, reference_maps
 from warp_reflect.techniques.local_map import REMS_MAX, RemWeights
 
 wp.set_module_options({"enable_backward": False})
@@ -253,7 +253,7 @@ def test_sky_has_no_distance_and_no_weights(device):
     radiance, distance = local.radiance(0), local.distance(0)
     assert np.isfinite(radiance).all() and np.isfinite(distance).all()
     assert not distance[:3].any() and not radiance[:3].any() and (distance[3:] > 0).all()
-    assert statistics["rem_missing"] == 0 and (state.numpy().reshape(6, -1)[:3] == local_map.TEXEL_SKY).all()
+    assert statistics["rem_missing"] == 0 and (state.numpy().reshape(6, -1)[:3] == local_shading.TEXEL_SKY).all()
 
 
 def test_weights_that_vanish_are_one_maps(device):

@@ -15,7 +15,8 @@ import warp_reflect as wr
 from warp_reflect import kernels, launch
 from warp_reflect.cubemap import texel_directions
 from warp_reflect.scene import Scene
-from warp_reflect.techniques import layered_environment, local_field, local_map
+from warp_reflect.techniques import layered_environment, local_field, local_maps, local_shading
+from warp_reflect.techniques.local_maps import LocalMaps
 
 SETTINGS = wr.Settings(
     environment_resolution=32, local_rays="field", field_cell=0.25, field_kind="heightfield", bounces=1
@@ -29,6 +30,20 @@ def scene(tmp_path_factory):
 
 def ball(scene) -> int:
     return next(k for k in scene.moving_parts if scene.parts[k].prim_path.endswith("Ball"))
+
+
+def still_map(scene, part: int, settings):
+    return layered_environment._still_maps(scene, [(part, settings)])[part, settings]
+
+
+def swept(scene, known, place, edge: int, kernels: str = "auto"):
+    """Inverse depths and triangles of a map at a place, flat; None where that is not in the open."""
+    if not local_field.in_the_open(scene, known, place[None])[0]:
+        return None, None
+    made = LocalMaps.empty(scene, place, [edge], known.field.cell, 1)
+    local_field.sweep(scene, known, made, SETTINGS.replace(kernels=kernels))
+    own = made.layout.texels(0)
+    return made.inverse.numpy()[own], made.triangle.numpy()[own]
 
 
 def unit_directions(edge: int) -> np.ndarray:
@@ -48,18 +63,18 @@ def test_swept_depths_are_those_of_rays_through_the_field(scene, up, edge):
     rng = np.random.default_rng(4)
     for _ in range(12):
         at = low + rng.uniform(0.05, 0.95, 3) * (turned.host_points.max(axis=0) - low)
-        mesh = local_field.sweep(turned, known, turned.origin + at, edge, 1)
+        inverse, triangle = swept(turned, known, turned.origin + at, edge)
         origins = wp.array(np.tile(at, (len(directions), 1)).astype(np.float32), dtype=wp.vec3)
         trace = known.field.intersect(origins, wp.array(directions.astype(np.float32), dtype=wp.vec3), 1)
-        if mesh is None:
+        if inverse is None:
             assert (trace.status.numpy() == wr.Status.INSIDE).any()
             continue
         asked += 1
         length = np.linalg.norm(texel_directions(edge).reshape(-1, 3), axis=1)
         met = trace.t.numpy() > 0
         expected = np.where(met, length / np.maximum(trace.t.numpy(), 1e-9), 0.0)
-        off = np.abs(mesh.inverse.reshape(-1) - expected) > 1e-4 * np.maximum(expected, 1e-3)
-        assert off.mean() < 0.002 and ((mesh.triangle.reshape(-1) >= 0) == (mesh.inverse.reshape(-1) > 0)).all()
+        off = np.abs(inverse - expected) > 1e-4 * np.maximum(expected, 1e-3)
+        assert off.mean() < 0.002 and ((triangle >= 0) == (inverse > 0)).all()
     assert asked >= 4
 
 
@@ -69,18 +84,16 @@ def test_a_place_in_a_house_or_beyond_the_columns_has_no_field(scene):
     own = scene.host_triangles[house.first_triangle : house.first_triangle + house.triangle_count]
     middle = scene.host_points[own.reshape(-1)].astype(np.float64).mean(axis=0) + scene.origin
     for place in (middle, middle + [1e4, 0, 0], middle + [0, 0, -1e9]):
-        assert local_field.depths(scene, known, place, 16, 4, 0.25, 1) is None
-    above = local_field.depths(scene, known, middle + [0, 50, 0], 16, 4, 0.25, 1)
-    assert np.isfinite(above.inverse).all() and (above.inverse > 0).any()
+        assert swept(scene, known, place, 16) == (None, None)
+    inverse, _ = swept(scene, known, middle + [0, 50, 0], 16)
+    assert np.isfinite(inverse).all() and (inverse > 0).any()
 
 
 @pytest.mark.parametrize("kind", ["heightfield", "occupancy"])
 def test_depths_of_a_field_are_those_of_the_triangles_but_at_edges(scene, kind):
     settings = SETTINGS.replace(field_kind=kind)
     part = ball(scene)
-    exact, found = (
-        layered_environment._still_map(scene, part, each) for each in (settings.replace(local_rays="exact"), settings)
-    )
+    exact, found = (still_map(scene, part, each) for each in (settings.replace(local_rays="exact"), settings))
     assert exact.slack == 0.0 and found.slack == pytest.approx(0.25)
     true, got = (each.local.distance(0).reshape(-1).astype(np.float64) for each in (exact, found))
     both = (true > 0) & (got > 0)
@@ -117,9 +130,7 @@ def test_fields_are_handed_over_in_time(scene):
     layered_environment.take_over(scene, later)
     assert local_field.local_field(later, SETTINGS) is known
     part = ball(later)
-    exact, found = (
-        layered_environment._still_map(later, part, each) for each in (SETTINGS.replace(local_rays="exact"), SETTINGS)
-    )
+    exact, found = (still_map(later, part, each) for each in (SETTINGS.replace(local_rays="exact"), SETTINGS))
     true, got = (each.local.distance(0).reshape(-1).astype(np.float64) for each in (exact, found))
     assert np.median(np.abs(got - true)[(true > 0) & (got > 0)]) < 1e-3
 
@@ -131,7 +142,7 @@ def test_values_that_cannot_be_are_refused(name, value):
 
 
 def test_what_is_compiled_ahead_is_what_fits_vectors():
-    assert kernels.ROW_MULTIPLE == local_map.ROW_MULTIPLE
+    assert kernels.ROW_MULTIPLE == local_maps.ROW_MULTIPLE
 
 
 @pytest.mark.parametrize("settings", [{}, {"rem_missing": "best", "rem_blur_px": 0.0}, {"rem_texels": "packed"}])
@@ -159,12 +170,9 @@ class Named:
 
 def test_shading_that_squares_share_is_that_of_one_of_them(scene):
     part = ball(scene)
-    one, four = (
-        layered_environment._still_map(scene, part, SETTINGS.replace(rem_blur_px=0.5, local_shade_step=step))
-        for step in (1, 4)
-    )
+    one, four = (still_map(scene, part, SETTINGS.replace(rem_blur_px=0.5, local_shade_step=step)) for step in (1, 4))
     np.testing.assert_array_equal(one.state.numpy(), four.state.numpy())
-    shaded = (one.state.numpy() == local_map.TEXEL_SHADED).reshape(6, 32, 32)
+    shaded = (one.state.numpy() == local_shading.TEXEL_SHADED).reshape(6, 32, 32)
     assert shaded.sum() > 500
     off = np.abs(one.local.radiance(0) - four.local.radiance(0)).max(-1)
     assert not off[~shaded].any() and 0.0 < off[shaded].mean() < 0.05

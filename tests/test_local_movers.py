@@ -13,7 +13,7 @@ from test_layered_environment import plan_of
 import warp_reflect as wr
 from warp_reflect.cubemap import texel_directions
 from warp_reflect.environment_maps import empty_maps
-from warp_reflect.techniques import environment, layered_environment, local_map, local_movers
+from warp_reflect.techniques import environment, layered_environment, local_movers, local_shading
 
 
 def car_stage(path, trailer: bool = False):
@@ -136,9 +136,9 @@ def test_texels_show_the_moving_triangles_that_their_rays_meet(tmp_path, edge, d
             moves = np.zeros(scene.triangle_count, bool)
             for part in (scene.parts[k] for k in scene.moving_parts):
                 moves[part.first_triangle : part.first_triangle + part.triangle_count] = True
-            ask = (*empty_map(scene, eye, edge, distance), scene.moving_parts, lambda seen: None, settings)
+            ask = (*empty_map(scene, eye, edge, distance), scene.moving_parts, lambda: None, settings)
             made, state, statistics = local_movers.draw_moving(scene, *ask)
-            shown = state.numpy() == local_map.TEXEL_SHADED
+            shown = state.numpy() == local_shading.TEXEL_SHADED
             met, t = far[0].numpy(), far[1].numpy()
             real = (met >= 0) & moves[met]
             apart = (distance == 0.0) | (np.abs(distance - t) > 1e-5 * distance)  # feet lie in the plane of the ground
@@ -155,7 +155,7 @@ def test_parts_that_are_not_asked_for_are_not_met(tmp_path):
     part = ball(scene)
     eye = layered_environment.centre_of(scene, part) - scene.origin
     asked = local_movers.moving_in(scene, part, wr.Settings())
-    ask = (*empty_map(scene, eye, 32, np.zeros(6 * 32 * 32, np.float32)), asked, lambda seen: None)
+    ask = (*empty_map(scene, eye, 32, np.zeros(6 * 32 * 32, np.float32)), asked, lambda: None)
     made, _, _ = local_movers.draw_moving(scene, *ask, wr.Settings(shadows="off", bounces=1))
     triangle = made.triangle(0)
     walker = scene.parts[asked[0]]

@@ -25,7 +25,7 @@ from warp_reflect import environment_maps
 from warp_reflect.cubemap import RADIANCE_AXES, texel_directions
 from warp_reflect.devices import open_device
 from warp_reflect.shadows import asked_shadows
-from warp_reflect.techniques import layered_environment, local_map, local_mesh, reference_maps
+from warp_reflect.techniques import layered_environment, local_map, local_mesh, local_shading, reference_maps
 from warp_reflect.techniques.environment import centre_of, left_out
 
 DEPTH_APART = 0.05  # of a distance: what is shown and lies farther off than this is another thing
@@ -150,7 +150,8 @@ class _Reflector:
 
 def forget(scene) -> None:
     """Drop the local maps that a scene keeps, so that the next one is built."""
-    for key in [key for key in scene.environments if key[0] == layered_environment.KEY]:
+    kept = layered_environment.KEY, layered_environment.SHOWN_KEY
+    for key in [key for key in scene.environments if key[0] in kept]:
         del scene.environments[key]
 
 
@@ -185,13 +186,13 @@ def angles(scene, made, references, settings) -> dict[str, np.ndarray | float]:
         along = np.einsum("ij,ij->i", shown, directions)
         angle += own * np.degrees(np.arctan2(sine, along))
         other += own * ((far == 0.0) | (np.abs(np.hypot(sine, along) - true) > DEPTH_APART * true))
-    blended = np.isin(state, (local_map.TEXEL_BLENDED, local_map.TEXEL_MISSING))
-    still = state != local_map.TEXEL_SHADED
+    blended = np.isin(state, (local_shading.TEXEL_BLENDED, local_shading.TEXEL_MISSING))
+    still = state != local_shading.TEXEL_SHADED
     judged = blended & (true > 0.0)
     return {
         "degrees": angle[judged],
         "shaded": 1.0 - float(still.mean()),
-        "sky": float(((state == local_map.TEXEL_SKY) != (true == 0.0))[still].mean()),
+        "sky": float(((state == local_shading.TEXEL_SKY) != (true == 0.0))[still].mean()),
         "other": float(other[judged].mean()) if judged.any() else 0.0,
     }
 
@@ -201,7 +202,7 @@ def weights(scene, made, maps, rems, settings) -> np.ndarray:
     n, found = made.local.resolution, []
     lengths = np.linalg.norm(texel_directions(n).reshape(-1, 3), axis=1)
     inverse = lengths / np.maximum(made.local.distance(0).reshape(-1), 1e-30)
-    inverse[made.state.numpy() == local_map.TEXEL_SKY] = 0.0
+    inverse[made.state.numpy() == local_shading.TEXEL_SKY] = 0.0
     shape = (6, n, n)
     mesh = local_mesh.DepthMesh(inverse.astype(np.float32).reshape(shape), made.local.triangle(0), np.ones(shape, bool))
     distance = np.array([distances(maps, int(k)).reshape(6, maps.resolution, -1) for k in rems])

@@ -550,7 +550,9 @@ def texel_hits(scene: Scene, gbuffer: GBuffer, threads: int = 0) -> tuple[Reflec
     return hits_layer(point, direction, gbuffer.triangle, u, v), distance
 
 
-def hits_layer(point: wp.array, direction: wp.array, triangle: wp.array, u: wp.array, v: wp.array) -> ReflectionLayer:
+def hits_layer(
+    point: wp.array, direction: wp.array, triangle: wp.array, u: wp.array, v: wp.array, pixel: wp.array | None = None
+) -> ReflectionLayer:
     """What texels see as the layer of a mirror that stands at the hits themselves, to be shaded.
 
     The cone that textures are looked up with has come that far from the eye of the G-buffer it is shaded with.
@@ -559,9 +561,11 @@ def hits_layer(point: wp.array, direction: wp.array, triangle: wp.array, u: wp.a
         point: The hits, vec3, scene frame.
         direction: Of the rays that met them, unit.
         triangle, u, v: As in `ReflectionLayer`.
+        pixel: Of the G-buffer that each is seen at, int32; None: at all of them in order.
     """
     device, count = triangle.device, len(triangle)
-    pixel = wp.array(np.arange(count, dtype=np.int32), dtype=int, device=device)
+    if pixel is None:
+        pixel = wp.array(np.arange(count, dtype=np.int32), dtype=int, device=device)
     pixels = MirrorPixels(0, pixel, point, direction, direction, (0, 0, 0, 0))
     layer = ReflectionLayer.empty(pixels, Technique.ENVIRONMENT, device)
     layer.triangle, layer.u, layer.v = triangle, u, v

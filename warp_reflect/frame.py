@@ -305,9 +305,10 @@ def reflect_scene(
         gbuffer, pixels = _look(scene, plan, view, timer)
         answered = {}
     layers = {}
-    for row in plan.rows:
-        if row.reflector.id not in pixels or pixels[row.reflector.id].count == 0:
-            continue
+    seen = [row for row in plan.rows if row.reflector.id in pixels and pixels[row.reflector.id].count > 0]
+    with timer("prepare"):
+        plan.prepare_together(row for row in seen if row.reflector.id not in answered)
+    for row in seen:
         if row.reflector.id in answered:
             layers[row.reflector.id] = answered[row.reflector.id]
             continue

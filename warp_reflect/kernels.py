@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 PACKAGE = __package__
 FORWARD = ("techniques.forward", "techniques.virtual_mesh")
-ROW_MULTIPLE = 16  # `local_map.ROW_MULTIPLE`, whose import would build Warp's modules before they are asked for
+ROW_MULTIPLE = 16  # `local_maps.ROW_MULTIPLE`, whose import would build Warp's modules before they are asked for
 # Name of a technique, or of an effect that is on, to kernel modules; a module's part stands after a slash, what is of vector
 # kernels alone after a bar, what is of plain ones after a minus.
 ROWS = {
@@ -29,7 +29,12 @@ ROWS = {
     "reflector_map": (*FORWARD, "techniques.reflector_map", "|techniques.map_vector"),
     "explosion_map": (*FORWARD, "techniques.explosion_map"),
     "environment": ("environment_maps",),
-    "layered_environment": ("environment_maps", "techniques.layered_environment", "-techniques.local_map"),
+    "layered_environment": (
+        "environment_maps",
+        "techniques.layered_environment",
+        "techniques.local_shading",
+        "-techniques.local_map",
+    ),
     "raytraced": ("bvh", "|bvh_vector"),
     "refinement": ("|techniques.refine_vector", "-techniques.refine"),
     "grid": ("techniques.interpolation",),
@@ -86,11 +91,12 @@ def of_plan(plan: Plan) -> list[str]:
     for row in seen:
         on = [row.technique, *(name for name, effect in row.effects.items() if effect.on)]
         asked += [module for name in on for module in ROWS.get(name, ())]
-        if row.technique == "layered_environment":
-            # One map alone is blended in vectors whatever `rem_count` is: that one is compiled where it is launched.
-            fits = row.settings.local_edge % ROW_MULTIPLE == 0 and row.settings.rem_count <= 2
-            asked.append("|techniques.local_map_vector" if fits else "techniques.local_map")
         asked += GLOSSY[row.effects["roughness"].numbers["way"]] if "roughness" in on else ()
+    local = [row.settings for row in seen if row.technique == "layered_environment"]
+    if local:
+        # One map alone is blended in vectors whatever `rem_count` is: that one is compiled where it is launched.
+        fits = any(each.local_edge % ROW_MULTIPLE == 0 and each.rem_count <= 2 for each in local)
+        asked.append("|techniques.local_map_vector" if fits else "techniques.local_map")
     if any(pane.pixels > 0 for pane in plan.panes):
         asked += ["transmission", "|transmission_vector"]
     return _of(asked, vector)

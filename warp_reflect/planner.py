@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from warp_reflect import (
@@ -37,7 +37,7 @@ from warp_reflect.reflectors import interface_of, is_transparent, mirror_roughne
 from warp_reflect.scene import Note, PartRange, Scene
 from warp_reflect.settings import Settings
 from warp_reflect.shadows import Shadows
-from warp_reflect.techniques import MAPS, TECHNIQUES
+from warp_reflect.techniques import MAPS, TECHNIQUES, TOGETHER
 
 METHODS = ("auto", "reference", "none")
 OF_ALL_TIMES = ("layered_environment",)  # prepare something that holds nothing that moves
@@ -199,6 +199,16 @@ class Plan:
             technique = TECHNIQUES[row.technique]
             self._prepared[row.reflector.id] = technique.prepare(self.scene, row.reflector, row.settings)
         return self._prepared[row.reflector.id]
+
+    def prepare_together(self, rows: Iterable[PlanRow]) -> None:
+        """Make what reflectors need that is not made yet, where their technique makes that of several at once."""
+        asked: dict[str, list[PlanRow]] = {}
+        for row in rows:
+            if row.technique in TOGETHER and row.reflector.id not in self._prepared:
+                asked.setdefault(row.technique, []).append(row)
+        for technique, alike in asked.items():
+            made = TECHNIQUES[technique].prepare_together(self.scene, [(row.reflector, row.settings) for row in alike])
+            self._prepared |= {row.reflector.id: each for row, each in zip(alike, made, strict=True)}
 
     def take_view(self, camera: Camera) -> EyeView | None:
         """What a camera sees of the plan's scene and mirrors, where that was drawn to decide; for one frame."""

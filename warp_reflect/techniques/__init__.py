@@ -37,3 +37,5 @@ TECHNIQUES = _Modules(
 )
 # What is seen is looked up in maps: there is no virtual picture, and nothing to refine.
 MAPS = ("environment", "layered_environment")
+# What mirrors need is made of several at once: the module has `prepare_together` too.
+TOGETHER = ("layered_environment",)

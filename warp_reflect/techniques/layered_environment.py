@@ -9,6 +9,7 @@ with Distance Impostors, Eurographics 2005, who have distances only; a triangle'
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from time import perf_counter
 
@@ -17,16 +18,16 @@ import warp as wp
 
 from warp_reflect import bvh, launch
 from warp_reflect.cubemap import FACE_COUNT
-from warp_reflect.environment_maps import CubeMaps, CubeMapsView, Onward, fetch_radiance, nearest_texel
+from warp_reflect.environment_maps import CubeMaps, CubeMapsView, Onward, copied_maps, fetch_radiance, nearest_texel
 from warp_reflect.layers import Camera, GBuffer, MirrorPixels, ReflectionLayer
 from warp_reflect.reflectors import mirror_weight
 from warp_reflect.scene import Note, Scene, SceneView
 from warp_reflect.settings import Settings, Status, Technique
 from warp_reflect.shade import LightView
 from warp_reflect.shapes import TriangleHit, clamp_weights, intersect_triangle, unit
-from warp_reflect.techniques import local_map, local_mesh, local_movers, reference_maps
+from warp_reflect.techniques import local_map, local_mesh, local_movers, local_shading, reference_maps
 from warp_reflect.techniques.environment import Shown, centre_of, onward_of, vehicle_of
-from warp_reflect.techniques.local_mesh import DepthMesh
+from warp_reflect.techniques.local_maps import SIDES, LocalMaps
 from warp_reflect.techniques.local_movers import moving_in
 from warp_reflect.techniques.reference_maps import ReferenceMaps
 
@@ -36,10 +37,11 @@ CONVERGED = wp.constant(int(Status.CONVERGED))
 SKY = wp.constant(int(Status.SKY))
 HIDDEN = wp.constant(int(Status.HIDDEN))
 MAX_ITERATIONS = wp.constant(int(Status.MAX_ITERATIONS))
-MISSING = wp.constant(local_map.TEXEL_MISSING)
-KEY, FIELD_KEY = "local maps", "field of local maps"
+MISSING = wp.constant(local_shading.TEXEL_MISSING)
+KEY, SHOWN_KEY, FIELD_KEY = "local maps", "local maps with what moves", "field of local maps"
 PLANE_STEPS = wp.constant(3)  # from texel to texel; walls settle in one or two
 NAMED = 4  # prims that a note names
+NO_CELLS = np.zeros((0, 4), np.int32)
 CANDIDATES_PER_MAP = 2  # maps that are looked at for each that is blended, where more than two are
 
 
@@ -52,6 +54,7 @@ class Prepared:
         cells: Of its depths' adaptive mesh, see `local_mesh.DepthMesh`.
         movers: Parts that move and that it may show.
         slack: Length by which its depths may be off.
+        together: Whether its arrays are parts of those of all maps that were made with it.
     """
 
     part: int
@@ -64,6 +67,7 @@ class Prepared:
     slack: float = 0.0
     statistics: dict = field(default_factory=dict)
     timings: dict = field(default_factory=dict)
+    together: bool = False
 
 
 def applies(scene: Scene, reflector) -> tuple[bool, str]:
@@ -105,66 +109,141 @@ def plan_notes(scene: Scene, reflector, settings: Settings) -> list[Note]:
 
 def prepare(scene: Scene, reflector, settings: Settings) -> Prepared:
     """Build the mirror's local map; the scene's reference maps are drawn at first use."""
-    return _prepared(scene, reflector.part, settings)
+    return prepare_together(scene, [(reflector, settings)])[0]
 
 
-def _prepared(scene: Scene, part: int, settings: Settings) -> Prepared:
-    made = _still_map(scene, part, settings)
-    movers = moving_in(scene, part, settings)
-    beyond = _beyond(scene, part, made.references.placement.centres, made.references.reach)
-    scene.notes += [note for note in beyond if note not in scene.notes]
-    if not movers or settings.environment_update == "previous":
-        return replace(made, movers=movers)
-    start = perf_counter()
-
-    def onward(parts: set[int]) -> Onward | None:
-        return _onward_of_still_maps(scene, parts, settings)
-
-    local, state, moved = local_movers.draw_moving(scene, made.local, made.state, movers, onward, settings)
-    timings = made.timings | {"local_moving": 1e3 * (perf_counter() - start)}
-    return replace(made, local=local, state=state, movers=movers, statistics=made.statistics | moved, timings=timings)
+def prepare_together(scene: Scene, asked: Sequence[tuple]) -> list[Prepared]:
+    """As `prepare`, of several (reflector, settings) at once: the same maps by fewer launches."""
+    found: dict[int, Prepared] = {}
+    for numbers in _alike(settings for _, settings in asked):
+        chosen = {k: (asked[k][0].part, asked[k][1]) for k in numbers}
+        found |= dict(zip(chosen, _prepared(scene, list(chosen.values())), strict=True))
+    return [found[k] for k in range(len(asked))]
 
 
-def _still_map(scene: Scene, part: int, settings: Settings) -> Prepared:
-    """A mirror's local map of what stands still, built at first use and kept with the scene."""
-    key = (KEY, part, settings)
-    if key not in scene.environments:
-        references = reference_maps.reference_maps(scene, settings)
-        centre = centre_of(scene, part)
-        start = perf_counter()
-        intersect = intersect_still(scene, part, centre, settings.threads)
-        mesh, slack = _depths(scene, part, centre, intersect, settings)
-        traced = perf_counter()
-        rems = nearest_maps(references, centre, settings.rem_count)
-        made = local_map.blend_local_map(scene, centre, mesh, intersect, references.maps, rems, settings, slack)
-        local, state, statistics = made
-        timings = {"local_rays": 1e3 * (traced - start), "local_blend": 1e3 * (perf_counter() - traced)}
-        statistics = mesh.statistics | statistics
-        scene.environments[key] = Prepared(
-            part, centre, references, local, state, mesh.cells, (), slack, statistics, timings
+def _alike(settings) -> list[list[int]]:
+    """Numbers of the settings that differ in `local_resolution` alone, together: not where mirrors show others' maps."""
+    groups: dict[tuple, list[int]] = {}
+    for k, each in enumerate(settings):
+        free = "local_resolution" if each.bounces <= 1 else ""
+        groups.setdefault(tuple(value for name, value in vars(each).items() if name != free), []).append(k)
+    return list(groups.values())
+
+
+def _prepared(scene: Scene, asked: list[tuple[int, Settings]]) -> list[Prepared]:
+    """The local maps of some (part, settings), whose settings differ in their resolutions alone."""
+    settings = asked[0][1]
+    movers = {part: moving_in(scene, part, settings) for part, _ in asked}
+    alone = settings.environment_update == "previous"
+    drawn = [each for each in dict.fromkeys(asked) if movers[each[0]] and not alone]
+    missing = [each for each in drawn if (SHOWN_KEY, *each) not in scene.environments]
+    # A map of what stands still is kept apart where another frame or another mirror may ask for it.
+    apart = settings.local_keep_px > 0.0 or settings.bounces > 1
+    still = _still_maps(scene, asked if apart else [each for each in asked if each not in drawn])
+    if missing:
+        scene.environments |= _drawn(scene, missing, [still[each] for each in missing] if apart else None, movers)
+    found = [scene.environments[SHOWN_KEY, *each] if each in drawn else still[each] for each in asked]
+    for each in found:
+        beyond = _beyond(scene, each.part, each.references.placement.centres, each.references.reach)
+        scene.notes += [note for note in beyond if note not in scene.notes]
+    return [replace(each, movers=movers[each.part]) if alone else each for each in found]
+
+
+def _drawn(scene: Scene, asked: list[tuple[int, Settings]], still: list[Prepared] | None, movers: dict) -> dict:
+    """Local maps with what moves, by their keys; from those of what stands still, or all at once."""
+    settings, start = asked[0][1], perf_counter()
+    if still is None:
+        local, references, slack = _blended(scene, asked)
+        blended = perf_counter()
+        timings = {"local_blend": 1e3 * (blended - start) / len(asked)}
+        shading = settings
+    else:
+        local = LocalMaps.empty(scene, [each.centre for each in still], [each.local.resolution for each in still])
+        for k, each in enumerate(still):
+            local.put(k, each.local, each.state)
+        timings, blended, shading = {}, start, settings.replace(rem_missing="best")
+    local_movers.meet_moving(scene, local, [movers[part] for part, _ in asked], settings)
+    local_shading.shade(scene, local, shading, lambda: _onward_of_still_maps(scene, local, settings))
+    timings["local_moving"] = 1e3 * (perf_counter() - blended) / len(asked)
+    made = {}
+    for k, (part, own) in enumerate(asked):
+        cube, state = local.cube_map(k)
+        moving = {"local_moving": local.statistics[k].get("local_moving", 0)}
+        if still is None:
+            known = Prepared(
+                part, local.centres[k], references, cube, state, local.cells.get(k, NO_CELLS), (), slack[k]
+            )
+            statistics = local.statistics[k] | moving
+        else:
+            known, statistics = still[k], still[k].statistics | moving
+        timings = known.timings | timings
+        key = (SHOWN_KEY, part, own)
+        made[key] = replace(
+            known, local=cube, state=state, movers=movers[part], statistics=statistics, timings=timings, together=True
         )
-    return scene.environments[key]
+    return made
 
 
-def _depths(scene: Scene, part: int, centre: np.ndarray, intersect, settings: Settings) -> tuple[DepthMesh, float]:
-    """What is around a mirror's centre, and the length by which that may be off."""
-    n, cells, ratio, device, threads = (
-        settings.local_edge,
-        settings.mesh_cells,
-        settings.depth_ratio,
-        scene.device,
-        settings.threads,
-    )
-    slack = 0.0
+def _still_maps(scene: Scene, asked: list[tuple[int, Settings]]) -> dict[tuple[int, Settings], Prepared]:
+    """Mirrors' local maps of what stands still, built at first use and kept with the scene; settings as for `_prepared`."""
+    missing = [each for each in dict.fromkeys(asked) if (KEY, *each) not in scene.environments]
+    if missing:
+        start = perf_counter()
+        local, references, slack = _blended(scene, missing)
+        local_shading.shade(scene, local, missing[0][1])
+        timings = {"local_blend": 1e3 * (perf_counter() - start) / len(missing)}
+        for k, (part, own) in enumerate(missing):
+            cube, state = local.cube_map(k)
+            cells, statistics = local.cells.get(k, NO_CELLS), local.statistics[k]
+            scene.environments[KEY, part, own] = Prepared(
+                part, local.centres[k], references, cube, state, cells, (), slack[k], statistics, timings, True
+            )
+    return {each: scene.environments[KEY, *each] for each in asked}
+
+
+def _blended(scene: Scene, asked: list[tuple[int, Settings]]) -> tuple[LocalMaps, ReferenceMaps, list[float]]:
+    """(Local maps blended from reference maps, what these do not see not shaded; the reference maps; `Prepared.slack`)."""
+    settings = asked[0][1]
+    references = reference_maps.reference_maps(scene, settings)
+    centres = np.array([centre_of(scene, part) for part, _ in asked])
     # A field holds what never moves: the body of a mirror that stands still would be around its own centre.
-    if settings.local_rays == "field" and part in scene.moving_parts:
+    by_field = np.array([settings.local_rays == "field" and part in scene.moving_parts for part, _ in asked])
+    swept, known = np.zeros(len(asked), bool), None
+    if by_field.any():
         from warp_reflect.techniques import local_field
 
         known = local_field.local_field(scene, settings)
-        mesh = None if known is None else local_field.depths(scene, known, centre, n, cells, ratio, threads)
-        if mesh is not None:
-            return mesh, known.field.cell
-    return local_mesh.trace_depth_mesh(n, intersect, cells, ratio, device, threads), slack
+        if known is not None and known.sides is not None:
+            swept = by_field & local_field.in_the_open(scene, known, centres)
+    meshes, slack = {}, np.where(swept, known.field.cell if known is not None else 0.0, 0.0)
+    for k in np.flatnonzero(~swept).tolist():
+        part, own = asked[k]
+        intersect = intersect_still(scene, part, centres[k], settings.threads)
+        mesh = None
+        ask = (own.local_edge, settings.mesh_cells, settings.depth_ratio)
+        if by_field[k] and known is not None and known.sides is None:
+            mesh = local_field.depths(scene, known, centres[k], *ask, settings.threads)
+            slack[k] = known.field.cell if mesh is not None else 0.0
+        if mesh is None:
+            mesh = local_mesh.trace_depth_mesh(
+                ask[0], intersect, *ask[1:], device=scene.device, threads=settings.threads
+            )
+        meshes[k] = mesh, intersect
+    local = LocalMaps.empty(scene, centres, [own.local_edge for _, own in asked], slack, swept)
+    if swept.any():
+        local_field.sweep(scene, known, local, settings)
+    for k, (mesh, _) in meshes.items():
+        local_map.put_mesh(local, k, mesh)
+        local.cells[k] = mesh.cells
+    rems = np.array([nearest_maps(references, centre, settings.rem_count) for centre in centres])
+    local_map.blend(scene, local, references.maps, rems, settings)
+    local_map.blend_again(scene, local, meshes, references.maps, rems, settings)
+    for k, known_of_map in enumerate(local.statistics):
+        if k in meshes:
+            known_of_map |= meshes[k][0].statistics
+        else:
+            known_of_map["local_lines"] = SIDES * local.layout.resolutions[k]
+    return local, references, slack.tolist()
 
 
 def take_over(earlier: Scene, scene: Scene) -> None:
@@ -188,12 +267,16 @@ def take_over(earlier: Scene, scene: Scene) -> None:
             continue
         shift = shift_px(known.local, centre_of(scene, key[1]))
         if shift < key[2].local_keep_px:
-            local = known.local.at(scene)
-            local.view.triangle = known.local.view.triangle
+            local = known.local
+            if known.together:  # its arrays are those of all that were made with it
+                local = copied_maps(local)
+            triangle = local.view.triangle
+            local = local.at(scene)
+            local.view.triangle = triangle
             statistics = known.statistics | {"local_kept": 1}
             references = reference_maps.known_maps(scene, key[2])
             scene.environments[key] = replace(
-                known, references=references, local=local, statistics=statistics, timings={}
+                known, references=references, local=local, statistics=statistics, timings={}, together=False
             )
 
 
@@ -206,14 +289,22 @@ def shift_px(local: CubeMaps, centre: np.ndarray) -> float:
     return float(angle * local.resolution / (0.5 * np.pi))
 
 
-def _onward_of_still_maps(scene: Scene, parts: set[int], settings: Settings) -> Onward | None:
-    """What mirrors among some parts show: their local maps of what stands still."""
+def _onward_of_still_maps(scene: Scene, local: LocalMaps, settings: Settings) -> Onward | None:
+    """What mirrors that move through some maps show: their local maps of what stands still."""
+    if settings.bounces <= 1:
+        return None
+    shown = np.unique(local.triangle.numpy()[local.state.numpy() == local_shading.TEXEL_MOVING])
+    first = np.array([scene.parts[k].first_triangle for k in scene.moving_parts])
+    count = np.array([scene.parts[k].triangle_count for k in scene.moving_parts])
+    seen = np.searchsorted(shown, first) < np.searchsorted(shown, first + count)
+    parts = [k for k, its in zip(scene.moving_parts, seen, strict=True) if its]
     mirrors = [k for k in parts if mirror_weight(scene, scene.parts[k], settings)]
-    if settings.bounces <= 1 or not mirrors:
+    if not mirrors:
         return None
     from warp_reflect.techniques import mirror_maps
 
-    return mirror_maps.of_maps(scene, {k: _still_map(scene, k, settings).local for k in mirrors}, settings.threads)
+    still = _still_maps(scene, [(k, settings) for k in mirrors])
+    return mirror_maps.of_maps(scene, {part: each.local for (part, _), each in still.items()}, settings.threads)
 
 
 def intersect_still(scene: Scene, part: int, centre: np.ndarray, threads: int) -> local_mesh.Intersect:
@@ -407,7 +498,7 @@ def _blend_levels(scene: Scene, prepared: Prepared, layer: ReflectionLayer, sett
         looked_up = layer
         if (resolution, frames) != levels[-1]:
             own = settings.replace(local_resolution=resolution)
-            other = _prepared(scene, prepared.part, own)
+            other = _prepared(scene, [(prepared.part, own)])[0]
             looked_up, _ = _looked_up(scene, other, layer.pixels, own, history)
         if radiance is not None:
             held = level_blend.approach(radiance, looked_up.radiance, frames, settings.local_blend, settings.threads)
@@ -425,7 +516,7 @@ def _looked_up(
     local, state, statistics = prepared.local, prepared.state, prepared.statistics
     if prepared.movers and settings.environment_update == "previous":
         onward = onward_of(scene, prepared.part, settings, history)
-        local, state, moved = local_movers.draw_moving(scene, local, state, prepared.movers, lambda _: onward, settings)
+        local, state, moved = local_movers.draw_moving(scene, local, state, prepared.movers, lambda: onward, settings)
         statistics = statistics | moved
     inputs = [scene.view, scene.lights, local.view, state, settings.parallax_steps, pixels.point, pixels.direction]
     inputs += [layer.triangle, layer.u, layer.v, layer.distance, layer.status, layer.radiance, settled]

@@ -20,26 +20,29 @@ from functools import cache
 import numpy as np
 import warp as wp
 
-from warp_reflect import launch
-from warp_reflect.cubemap import FACE_COUNT, RADIANCE_AXES, radiance_direction
+from warp_reflect import launch, vector
+from warp_reflect.cubemap import RADIANCE_AXES
 from warp_reflect.grid_rays import FAR, UP_AXES, border_time, swap_up
 from warp_reflect.heightfield import HOLE, HeightfieldView, column_height, out_of_field
 from warp_reflect.launch import FINITE_FLAGS
 from warp_reflect.scene import Scene
 from warp_reflect.scene_field import SceneField, make_field
 from warp_reflect.settings import Settings, Status
+from warp_reflect.techniques.local_maps import LINES, LocalMaps, LocalPlace, texel_towards
 from warp_reflect.techniques.local_mesh import DepthMesh, trace_depth_mesh
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FINITE_FLAGS})
 
 KEY = "field of local maps"
-SIDES = 4  # faces of a map, and sides of a column: towards lower and higher x, then y
 STEP_LEAST = 0.5  # cells: lower steps of the field are taken for slopes, of the triangle that the column shows
 WALL_REACH = 1.5  # cells from the middle of the column before a wall in which its triangle is looked for
 LEAST_HEIGHT = wp.constant(1.0e-6)  # cells over a roof: less is this
 OPEN_SLACK = wp.constant(0.05)  # share of a slope: the corner of a roof may rise between two lines
 HOLE_BELOW = 1.0  # cells below a top that a wall beside a hole is taken to reach
 SPLIT_MIN = 32  # lines; a walk takes 2 to 20 us
+GROUP_LINES = wp.constant(LINES)
+STEEP_BLOCK = wp.constant(vector.BLOCK)
+COLUMN_SIDES = 4  # towards lower and higher x, then y
 
 
 @wp.struct
@@ -53,13 +56,14 @@ class FieldSides:
 
 @wp.struct
 class SideFace:
-    """A side face of a map in the axes of a field: texel (line, step) is element base + line line_stride + step step_stride."""
+    """A side face of a map in the axes of a field, see `side_texel`."""
 
     ahead: wp.vec2  # the face's axis
     across: wp.vec2  # towards higher lines
-    base: int
-    line_stride: int
-    step_stride: int
+    face: int
+    corner: wp.vec2i  # 1: line 0, step 0 is the last row, the last column
+    line_step: wp.vec2i  # rows and columns from line to line
+    rise_step: wp.vec2i  # from step to step
 
 
 @dataclass(frozen=True)
@@ -70,11 +74,13 @@ class LocalField:
         field: Of what never moves.
         sides: Of its columns; None where it is no heightfield.
         origin: Of the frame that the field lies in, world, float64 [3]: of the scene that it was made for.
+        heights: Of its columns, float32 [ny, nx], as kernels have them; None where it is no heightfield.
     """
 
     field: SceneField
     sides: FieldSides | None
     origin: np.ndarray
+    heights: np.ndarray | None = None
 
 
 @wp.struct
@@ -118,26 +124,32 @@ def side_triangle(sides: FieldSides, column: int, axis: int, step: int) -> int:
     return wp.where(found >= 0, found, sides.roof[column])
 
 
-@wp.kernel
-def sweep_lines_kernel(
-    first: int,
+@wp.func
+def side_texel(face: SideFace, n: int, line: int, step: int) -> int:
+    """The texel of a map at a line of a side face, so many steps up."""
+    row = face.corner[0] * (n - 1) + face.line_step[0] * line + face.rise_step[0] * step
+    column = face.corner[1] * (n - 1) + face.line_step[1] * line + face.rise_step[1] * step
+    return (face.face * n + row) * n + column
+
+
+@wp.func
+def sweep_line(
     field: HeightfieldView,
     sides: FieldSides,
     faces: wp.array(dtype=SideFace),
-    eye: wp.vec3,
-    resolution: int,
-    # Outputs:
+    place: LocalPlace,
+    origin: wp.vec3,
+    k: int,
     out_inverse: wp.array(dtype=float),
     out_triangle: wp.array(dtype=int),
     out_open: wp.array(dtype=float),
 ):
-    """One thread per line of texels above one another: the slope from which on it sees the sky, and what is below."""
-    k = first + wp.tid()
-    n = resolution
+    """Line k of a map's side faces: the slope from which on it sees the sky, and what is below; `origin` is the field's."""
+    n = place.resolution
     face = faces[k / n]
     line = k - (k / n) * n
     lateral = (2.0 * float(line) + 1.0) / float(n) - 1.0
-    walk = level_walk(field, eye, face.ahead + lateral * face.across)
+    walk = level_walk(field, place.eye + origin, face.ahead + lateral * face.across)
     x = walk.x
     y = walk.y
     scale = field.place.inverse
@@ -154,7 +166,7 @@ def sweep_lines_kernel(
         height = column_height(field, x, y) - walk.origin[2]
         # Into its wall, then onto its roof; a time of 1 is one cell along the face's axis.
         while step < n and t_in > 0.0 and rise * t_in <= height:
-            i = face.base + line * face.line_stride + step * face.step_stride
+            i = place.first_texel + side_texel(face, n, line, step)
             out_inverse[i] = scale / t_in
             out_triangle[i] = side_triangle(
                 sides, y * field.nx + x, axis, wp.where(axis == 0, walk.step_x, walk.step_y)
@@ -164,7 +176,7 @@ def sweep_lines_kernel(
         if step == n and t_in > 0.0:
             highest = wp.max(highest, height / t_in)
         while step < n and rise * t_out <= height:
-            i = face.base + line * face.line_stride + step * face.step_stride
+            i = place.first_texel + side_texel(face, n, line, step)
             out_inverse[i] = scale / wp.max(t_in, wp.min(height / rise, t_out))
             out_triangle[i] = sides.roof[y * field.nx + x]
             step += 1
@@ -190,44 +202,59 @@ def sweep_lines_kernel(
         t_in = t_out
         if out_of_field(field, x, y) or highest * t_out > field.top - walk.origin[2]:
             walking = 0
-    out_open[k] = highest
+    out_open[place.first_group * GROUP_LINES + k] = highest
     while step < n:
-        i = face.base + line * face.line_stride + step * face.step_stride
+        i = place.first_texel + side_texel(face, n, line, step)
         out_inverse[i] = 0.0
         out_triangle[i] = -1
         step += 1
 
 
 @wp.kernel
-def trace_steep_kernel(
+def sweep_lines_kernel(
     first: int,
     field: HeightfieldView,
     sides: FieldSides,
     faces: wp.array(dtype=SideFace),
-    open_from: wp.array(dtype=float),
-    eye: wp.vec3,
-    resolution: int,
-    steep: wp.vec2i,
+    places: wp.array(dtype=LocalPlace),
+    group_map: wp.array(dtype=int),
+    origin: wp.vec3,
     # Outputs:
     out_inverse: wp.array(dtype=float),
     out_triangle: wp.array(dtype=int),
+    out_open: wp.array(dtype=float),
 ):
-    """One thread per texel of the two faces (that of `steep[0]` looks up) which look along the field's third axis."""
-    i = first + wp.tid()
-    n = resolution
+    """One thread per line of texels above one another."""
+    k = first + wp.tid()
+    place = places[group_map[k / GROUP_LINES]]
+    line = k - place.first_group * GROUP_LINES
+    if place.swept == 1 and line < 4 * place.resolution:
+        sweep_line(field, sides, faces, place, origin, line, out_inverse, out_triangle, out_open)
+
+
+@wp.func
+def trace_steep(
+    field: HeightfieldView,
+    sides: FieldSides,
+    faces: wp.array(dtype=SideFace),
+    open_from: wp.array(dtype=float),
+    place: LocalPlace,
+    origin: wp.vec3,
+    steep: wp.vec2i,
+    i: int,
+    out_inverse: wp.array(dtype=float),
+    out_triangle: wp.array(dtype=int),
+):
+    """Texel i of the two faces of a map (that of `steep[0]` looks up) which look along the field's third axis."""
+    n = place.resolution
     upwards = i < n * n
-    face = wp.where(upwards, steep[0], steep[1])
-    rest = wp.where(upwards, i, i - n * n)
-    row = rest / n
-    texel = face * n * n + rest
-    u = (2.0 * float(rest - row * n) + 1.0) / float(n) - 1.0
-    v = (2.0 * float(row) + 1.0) / float(n) - 1.0
-    towards = radiance_direction(face, u, v)
+    own = wp.where(upwards, steep[0] * n * n + i, steep[1] * n * n + i - n * n)
+    texel = place.first_texel + own
+    d = swap_up(field.place, texel_towards(place, own))
     out_inverse[texel] = 0.0
     out_triangle[texel] = -1
     if upwards:
         # Open sky where it is above both lines beside: they are less than a column apart.
-        d = swap_up(field.place, towards)
         closed = int(0)
         for k in range(4):
             along = faces[k].ahead[0] * d[0] + faces[k].ahead[1] * d[1]
@@ -236,13 +263,13 @@ def trace_steep_kernel(
                 at = 0.5 * (lateral / along + 1.0) * float(n) - 0.5
                 lower = int(wp.floor(at))
                 for side in range(2):
-                    if open_from[k * n + wp.clamp(lower + side, 0, n - 1)] * along > 1.0 - OPEN_SLACK:
+                    beside = place.first_group * GROUP_LINES + k * n + wp.clamp(lower + side, 0, n - 1)
+                    if open_from[beside] * along > 1.0 - OPEN_SLACK:
                         closed = int(1)
         if closed == 0:
             return
     rise = wp.where(upwards, 1.0, -1.0)
-    d = swap_up(field.place, towards)
-    walk = level_walk(field, eye, wp.vec2(d[0], d[1]))
+    walk = level_walk(field, place.eye + origin, wp.vec2(d[0], d[1]))
     x = walk.x
     y = walk.y
     top = field.top - walk.origin[2]
@@ -271,15 +298,39 @@ def trace_steep_kernel(
             walking = 0
 
 
+@wp.kernel
+def trace_steep_kernel(
+    first: int,
+    field: HeightfieldView,
+    sides: FieldSides,
+    faces: wp.array(dtype=SideFace),
+    open_from: wp.array(dtype=float),
+    places: wp.array(dtype=LocalPlace),
+    steep_map: wp.array(dtype=int),
+    origin: wp.vec3,
+    steep: wp.vec2i,
+    # Outputs:
+    out_inverse: wp.array(dtype=float),
+    out_triangle: wp.array(dtype=int),
+):
+    """One thread per texel that looks up or down."""
+    k = first + wp.tid()
+    place = places[steep_map[k / STEEP_BLOCK]]
+    i = k - place.first_steep * STEEP_BLOCK
+    if place.swept == 1 and i < 2 * place.resolution * place.resolution:
+        trace_steep(field, sides, faces, open_from, place, origin, steep, i, out_inverse, out_triangle)
+
+
 def local_field(scene: Scene, settings: Settings) -> LocalField | None:
     """The field of what never moves in a scene, made at first use and kept with it; None where nothing stands still."""
     key = (KEY, settings.field_kind, settings.field_cell, settings.field_overhang)
     if key not in scene.environments:
         field = make_field(scene, settings, scene.moving_parts)
-        sides = None
+        sides = heights = None
         if field is not None and field.kind == "heightfield":
-            sides = _sides(scene, field, settings.threads)
-        scene.environments[key] = None if field is None else LocalField(field, sides, scene.origin.copy())
+            heights = _heights(field)
+            sides = _sides(scene, field, heights, settings.threads)
+        scene.environments[key] = None if field is None else LocalField(field, sides, scene.origin.copy(), heights)
     return scene.environments[key]
 
 
@@ -290,19 +341,25 @@ def take_over(earlier: Scene, scene: Scene) -> None:
             scene.environments[key] = known
 
 
-def _sides(scene: Scene, field: SceneField, threads: int) -> FieldSides:
+def _heights(field: SceneField) -> np.ndarray:
+    grid = field.grid
+    return grid.view.heights.numpy()[: grid.nx * grid.ny].reshape(grid.ny, grid.nx).copy()
+
+
+def _sides(scene: Scene, field: SceneField, heights: np.ndarray, threads: int) -> FieldSides:
     """The triangles of the sides that stand out, each by a level ray from the middle of the column before it."""
     grid, view = field.grid, field.grid.view
     count = grid.nx * grid.ny
-    heights = view.heights.numpy()[:count].reshape(grid.ny, grid.nx).astype(np.float64)
-    around = np.pad(heights, 1, constant_values=float(HOLE))
+    around = np.pad(heights.astype(np.float64), 1, constant_values=float(HOLE))
     own = around[1:-1, 1:-1]
     before = (around[1:-1, :-2], around[1:-1, 2:], around[:-2, 1:-1], around[2:, 1:-1])
     row = np.full(count, -1, np.int32)
-    stands = np.stack([(own > float(HOLE)) & (own - low > STEP_LEAST) for low in before], -1).reshape(count, SIDES)
+    stands = np.stack([(own > float(HOLE)) & (own - low > STEP_LEAST) for low in before], -1).reshape(
+        count, COLUMN_SIDES
+    )
     walled = np.flatnonzero(stands.any(axis=1))
     row[walled] = np.arange(len(walled))
-    found = np.full((len(walled), SIDES), -1, np.int32)
+    found = np.full((len(walled), COLUMN_SIDES), -1, np.int32)
     up = UP_AXES[scene.data.up_axis]
     axes = [0, 3 - up, up]
     corner = np.array([*view.place.corner])
@@ -329,41 +386,52 @@ def _sides(scene: Scene, field: SceneField, threads: int) -> FieldSides:
 
 
 @cache
-def _side_faces(resolution: int, up: int) -> tuple[list[tuple], tuple[int, int]]:
-    """(The side faces' fields of `SideFace`; the faces that look up and down)."""
-    n = resolution
+def _side_faces(up: int, device: str) -> tuple[wp.array, wp.vec2i]:
+    """(The side faces; the faces that look up and down)."""
     level = [0, 3 - up]
     faces, steep = [], [0, 0]
-    for face, (right, above, forward) in enumerate(RADIANCE_AXES):
+    for number, (right, above, forward) in enumerate(RADIANCE_AXES):
         if forward[up] != 0.0:
-            steep[0 if forward[up] > 0.0 else 1] = face
+            steep[0 if forward[up] > 0.0 else 1] = number
             continue
-        first = face * n * n
+        face = SideFace()
+        face.face = number
         if above[up] != 0.0:  # rows lie above one another
-            base, strides = (first + (n - 1) * n, (1, -n)) if above[up] > 0.0 else (first, (1, n))
-            across = right
+            upright, across = above[up] > 0.0, right
+            face.corner, face.line_step = wp.vec2i(int(upright), 0), wp.vec2i(0, 1)
+            face.rise_step = wp.vec2i(-1 if upright else 1, 0)
         else:
-            base, strides = (first, (n, 1)) if right[up] > 0.0 else (first + n - 1, (n, -1))
-            across = -above
-        faces.append((forward[level], across[level], base, *strides))
-    return faces, tuple(steep)
+            rightwards, across = right[up] > 0.0, -above
+            face.corner, face.line_step = wp.vec2i(0, int(not rightwards)), wp.vec2i(1, 0)
+            face.rise_step = wp.vec2i(0, 1 if rightwards else -1)
+        face.ahead, face.across = wp.vec2(*forward[level]), wp.vec2(*across[level])
+        faces.append(face)
+    return wp.array(faces, dtype=SideFace, device=device), wp.vec2i(*steep)
+
+
+def in_the_open(scene: Scene, known: LocalField, centres: np.ndarray) -> np.ndarray:
+    """Which places (world, float64 [n, 3]) lie over the columns of a heightfield and above what is there, bool [n]."""
+    view, up = known.field.grid.view, UP_AXES[scene.data.up_axis]
+    at = (centres - known.origin - np.array([*view.place.corner]))[:, [0, 3 - up, up]] / known.field.cell
+    column = np.floor(at[:, :2])
+    inside = ((column >= 0) & (column < [view.nx, view.ny])).all(axis=1)
+    x, y = np.where(inside[:, None], column, 0.0).astype(int).T
+    return inside & (at[:, 2] > known.heights[y, x])
 
 
 def depths(
     scene: Scene, known: LocalField, centre: np.ndarray, resolution: int, cells: int, ratio: float, threads: int = 0
 ) -> DepthMesh | None:
-    """Depths of a map at a place; None where the place is not in the open.
+    """Depths of a map at a place by rays through a field that is no heightfield; None where the place is not in the open.
 
     Args:
         scene: The field's.
         known: The field.
         centre: Of the map, world, float64 [3].
         resolution: Texels along a cube edge.
-        cells, ratio: Of the mesh whose nodes are traced where the field is no heightfield, see `trace_depth_mesh`.
+        cells, ratio: Of the mesh whose nodes are traced, see `trace_depth_mesh`.
         threads: CPU threads; 0: one per core.
     """
-    if known.sides is not None:
-        return sweep(scene, known, centre, resolution, threads)
     inside = []
 
     def intersect(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -378,41 +446,22 @@ def depths(
     return None if any(inside) else mesh
 
 
-def sweep(scene: Scene, known: LocalField, centre: np.ndarray, resolution: int, threads: int = 0) -> DepthMesh | None:
-    """Depths at every texel of a map at a place (world, float64 [3]); None where the place is not in the open."""
-    view, n, device = known.field.grid.view, resolution, scene.device
-    up = UP_AXES[scene.data.up_axis]
-    eye = centre - known.origin
-    at = (eye - np.array([*view.place.corner]))[[0, 3 - up, up]] / known.field.cell
-    column = np.floor(at[:2]).astype(int)
-    if (column < 0).any() or column[0] >= view.nx or column[1] >= view.ny:
-        return None
-    # One number: the field's own columns stay where they are.
-    number = int(column[1]) * view.nx + int(column[0])
-    if at[2] <= float(view.heights[number : number + 1].numpy()[0]):
-        return None
-    faces, steep = _device_faces(n, up, str(device))
-    inverse = wp.empty(FACE_COUNT * n * n, dtype=float, device=device)
-    triangle = wp.empty(FACE_COUNT * n * n, dtype=int, device=device)
-    open_from = wp.empty(SIDES * n, dtype=float, device=device)
-    place = wp.vec3(*eye)
-    inputs = [view, known.sides, faces, place, n, inverse, triangle, open_from]
-    launch.launch(sweep_lines_kernel, SIDES * n, inputs, device, threads, split_min=SPLIT_MIN)
-    inputs = [view, known.sides, faces, open_from, place, n, steep, inverse, triangle]
-    launch.launch(trace_steep_kernel, 2 * n * n, inputs, device, threads)
-    shape = (FACE_COUNT, n, n)
-    mesh = DepthMesh(inverse.numpy().reshape(shape), triangle.numpy().reshape(shape), np.ones(shape, bool))
-    mesh.statistics["local_lines"] = SIDES * n
-    return mesh
+def sweep(scene: Scene, known: LocalField, maps: LocalMaps, settings: Settings) -> None:
+    """Depths at every texel of the maps that are swept, whose places are in the open of a heightfield.
 
-
-@cache
-def _device_faces(resolution: int, up: int, device: str) -> tuple[wp.array, wp.vec2i]:
-    faces, steep = _side_faces(resolution, up)
-    made = []
-    for ahead, across, base, line_stride, step_stride in faces:
-        face = SideFace()
-        face.ahead, face.across = wp.vec2(*ahead), wp.vec2(*across)
-        face.base, face.line_stride, face.step_stride = base, line_stride, step_stride
-        made.append(face)
-    return wp.array(made, dtype=SideFace, device=device), wp.vec2i(*steep)
+    Args:
+        scene: Of the maps.
+        known: The field.
+        maps: Get `inverse` and `triangle`.
+        settings: `threads`, `kernels`.
+    """
+    view, device, where = known.field.grid.view, scene.device, maps.layout
+    faces, steep = _side_faces(UP_AXES[scene.data.up_axis], str(device))
+    lines = len(where.group_map) * LINES
+    open_from = wp.empty(lines, dtype=float, device=device)
+    origin, outputs = wp.vec3(*(scene.origin - known.origin)), [maps.inverse, maps.triangle]
+    inputs = [view, known.sides, faces, maps.places, where.group_map, origin, *outputs, open_from]
+    threads = settings.threads
+    launch.launch(sweep_lines_kernel, lines, inputs, device, threads, split_min=SPLIT_MIN)
+    inputs = [view, known.sides, faces, open_from, maps.places, where.steep_map, origin, steep, *outputs]
+    launch.launch(trace_steep_kernel, len(where.steep_map) * vector.BLOCK, inputs, device, threads)

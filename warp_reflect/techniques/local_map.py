@@ -19,36 +19,26 @@ the texel in the direction of I is blended from the REMs that see I. Differs fro
 
 from __future__ import annotations
 
-from functools import cache
+from collections.abc import Mapping
 
 import numpy as np
 import warp as wp
 
-from warp_reflect import launch, shade, vector
-from warp_reflect.cubemap import FACE_COUNT, radiance_direction
-from warp_reflect.environment_maps import (
-    CubeMaps,
-    CubeMapsView,
-    Onward,
-    empty_maps,
-    face_camera,
-    fetch_covered,
-    hits_layer,
-    nearest_texel,
-    texel_distance,
-)
-from warp_reflect.layers import GBuffer
+from warp_reflect import launch, vector
+from warp_reflect.environment_maps import CubeMaps, CubeMapsView, fetch_covered, nearest_texel, texel_distance
 from warp_reflect.scene import Scene, SceneView
 from warp_reflect.settings import Settings
 from warp_reflect.shade import LightView, dome_radiance
-from warp_reflect.shadows import asked_shadows
-from warp_reflect.shapes import clamp_weights, facet_normal, intersect_triangle, unit
+from warp_reflect.shapes import facet_normal, unit
+from warp_reflect.techniques import local_shading
+from warp_reflect.techniques.local_maps import ROW_MULTIPLE, LocalMaps, LocalPlace, texel_towards
 from warp_reflect.techniques.local_mesh import DepthMesh, Intersect
+from warp_reflect.techniques.local_shading import TEXEL_BLENDED, TEXEL_MISSING, TEXEL_SKY
 
 wp.set_module_options({"enable_backward": False})
 
 REMS_MAX = 8  # maps that a local map may look at
-ROW_MULTIPLE = 16  # texels: no vector of them goes over the end of a row
+TEXEL_BLOCK = wp.constant(vector.BLOCK)
 RemWeights = wp.types.vector(length=REMS_MAX, dtype=wp.float32)
 
 # The depth test's slack: texels' footprint on the surface, and rounding (algorithms: 0.3 to 2 % of the visible fail it).
@@ -65,12 +55,6 @@ SCALE_PENALTY = wp.constant(0.2)  # per doubled distance, against an angle in ra
 
 PLANE_REACH = wp.constant(8.0)  # times the slack: farther along the ray a plane within the slack is grazed, and not met
 WHOLE = wp.constant(0.999)  # coverage of a look-up from which on the sky behind it is not asked
-
-# Of a texel after resampling.
-TEXEL_SKY = 0
-TEXEL_BLENDED = 1
-TEXEL_MISSING = 2  # no REM sees its point
-TEXEL_SHADED = 3  # nor did one, and it was shaded where it is
 
 
 @wp.func
@@ -236,11 +220,9 @@ def blend_texel(
     maps: CubeMapsView,
     rems: wp.array(dtype=int),
     used: int,
-    eye: wp.vec3,
-    slack: float,
+    place: LocalPlace,
     blur_max: float,
     shaded: int,
-    resolution: int,
     i: int,
     inverse: wp.array(dtype=float),
     triangle: wp.array(dtype=int),
@@ -248,19 +230,18 @@ def blend_texel(
     out_distance: wp.array(dtype=float),
     out_state: wp.array(dtype=wp.uint8),
 ):
-    """Colour, distance and state of a texel; arguments as for `blend_kernel`."""
-    n = resolution
-    face = i / (n * n)
-    row = (i - face * n * n) / n
-    column = i - (face * n + row) * n
+    """Colour, distance and state of a texel of the map at `place`; arguments as for `blend_kernel`."""
+    n = place.resolution
+    eye = place.eye
+    slack = place.slack
+    if i - place.first_texel >= 6 * n * n:
+        return
     if inverse[i] <= 0.0:
         out_radiance[i] = wp.vec4(0.0, 0.0, 0.0, 0.0)
         out_distance[i] = 0.0
         out_state[i] = wp.uint8(TEXEL_SKY)
         return
-    u = (2.0 * float(column) + 1.0) / float(n) - 1.0
-    v = (2.0 * float(row) + 1.0) / float(n) - 1.0
-    towards = radiance_direction(face, u, v)
+    towards = texel_towards(place, i - place.first_texel)
     depth = 1.0 / inverse[i]
     off = slack
     normal = wp.vec3(0.0, 0.0, 0.0)
@@ -318,13 +299,12 @@ def blend_kernel(
     scene: SceneView,
     lights: LightView,
     maps: CubeMapsView,
-    rems: wp.array(dtype=int),
+    rems: wp.array2d(dtype=int),
     used: int,
-    eye: wp.vec3,
-    slack: float,
+    places: wp.array(dtype=LocalPlace),
+    block_map: wp.array(dtype=int),
     blur_max: float,
     shaded: int,
-    resolution: int,
     index: wp.array(dtype=int),
     inverse: wp.array(dtype=float),
     triangle: wp.array(dtype=int),
@@ -333,21 +313,23 @@ def blend_kernel(
     out_distance: wp.array(dtype=float),
     out_state: wp.array(dtype=wp.uint8),
 ):
-    """One thread per texel; where `index` has a length, of those. `shaded`: what no map sees is shaded afterwards."""
+    """One thread per texel; where `index` has a length, of those. `shaded`: what no map sees is shaded afterwards.
+
+    Row k of `rems` has the reference maps that map k looks at.
+    """
     i = first + wp.tid()
     if index.shape[0] > 0:
         i = index[i]
+    k = block_map[i / TEXEL_BLOCK]
     blend_texel(
         scene,
         lights,
         maps,
-        rems,
+        rems[k],
         used,
-        eye,
-        slack,
+        places[k],
         blur_max,
         shaded,
-        resolution,
         i,
         inverse,
         triangle,
@@ -357,67 +339,79 @@ def blend_kernel(
     )
 
 
-@wp.kernel
-def shaded_hits_kernel(
-    first: int,
-    scene: SceneView,
-    eye: wp.vec3,
-    resolution: int,
-    texel: wp.array(dtype=int),
-    distance: wp.array(dtype=float),
-    triangle: wp.array(dtype=int),
-    # Outputs:
-    out_point: wp.array(dtype=wp.vec3),
-    out_direction: wp.array(dtype=wp.vec3),
-    out_triangle: wp.array(dtype=int),
-    out_u: wp.array(dtype=float),
-    out_v: wp.array(dtype=float),
-):
-    """One thread per texel that is shaded at its own hit."""
-    i = first + wp.tid()
-    t = texel[i]
-    n = resolution
-    face = t / (n * n)
-    row = (t - face * n * n) / n
-    column = t - (face * n + row) * n
-    u = (2.0 * float(column) + 1.0) / float(n) - 1.0
-    v = (2.0 * float(row) + 1.0) / float(n) - 1.0
-    direction = wp.normalize(radiance_direction(face, u, v))
-    corner = scene.triangles[triangle[t]]
-    hit = intersect_triangle(eye, direction, scene.points[corner[0]], scene.points[corner[1]], scene.points[corner[2]])
-    weights = clamp_weights(hit.u, hit.v)
-    if hit.det == 0.0:
-        weights = wp.vec2(1.0 / 3.0, 1.0 / 3.0)
-    out_point[i] = eye + distance[t] * direction
-    out_direction[i] = direction
-    out_triangle[i] = triangle[t]
-    out_u[i] = weights[0]
-    out_v[i] = weights[1]
-
-
-@wp.kernel
-def put_radiance_kernel(
-    first: int,
-    texel: wp.array(dtype=int),
-    source: wp.array(dtype=int),
-    radiance: wp.array(dtype=wp.vec3),
-    out_radiance: wp.array(dtype=wp.vec4),
-):
-    """One thread per texel that shows what was shaded, `source`, or its own; a value that is not finite is black."""
-    i = first + wp.tid()
-    r = wp.vec3(0.0, 0.0, 0.0)
-    if source.shape[0] > 0:
-        r = radiance[source[i]]
-    else:
-        r = radiance[i]
-    if not (wp.isfinite(r[0]) and wp.isfinite(r[1]) and wp.isfinite(r[2])):
-        r = wp.vec3(0.0, 0.0, 0.0)
-    out_radiance[texel[i]] = wp.vec4(r[0], r[1], r[2], 1.0)
-
-
 def vector_fits(resolution: int, used: int, rem_count: int) -> bool:
     """Whether blocks of texels are blended at once: rows of whole vectors, and one or two maps."""
     return resolution % ROW_MULTIPLE == 0 and min(used, rem_count) <= 2
+
+
+def blend(
+    scene: Scene,
+    local: LocalMaps,
+    maps: CubeMaps,
+    rems: np.ndarray,
+    settings: Settings,
+    texels: np.ndarray | None = None,
+) -> None:
+    """Colour the texels of local maps from reference maps.
+
+    Args:
+        scene: Of the maps.
+        local: Its depths; gets all else.
+        maps: The reference maps.
+        rems: Numbers of those that each looks at, the nearest first, int [local maps, at most `REMS_MAX`].
+        settings: `rem_count`, `rem_missing`, `rem_blur_px`, `threads`, `kernels`.
+        texels: Only these.
+    """
+    device, threads, where = scene.device, settings.threads, local.layout
+    chosen = wp.array(np.ascontiguousarray(rems, np.int32), dtype=int, device=device)
+    ask = [scene.lights, maps.view, chosen, settings.rem_count, local.places, where.block_map]
+    ask += [settings.rem_blur_px, int(settings.rem_missing == "shade")]
+    outputs = [local.inverse, local.triangle, local.radiance, local.distance, local.state]
+    fits = any(vector_fits(n, settings.rem_count, chosen.shape[1]) for n in where.resolutions)
+    if texels is None and fits and vector.chosen(settings.kernels, device):
+        from warp_reflect.techniques.local_map_vector import blend_blocks_kernel  # which uses this module's functions
+
+        inputs = [scene.view, scene.triangle_records, *ask, *outputs]
+        vector.launch_blocks(blend_blocks_kernel, where.texel_count, inputs, device, threads)
+        return
+    index = wp.array(np.zeros(0, np.int32) if texels is None else texels, dtype=int, device=device)
+    count = where.texel_count if texels is None else len(texels)
+    launch.launch(blend_kernel, count, [scene.view, *ask, index, *outputs], device, threads)
+
+
+def blend_again(
+    scene: Scene,
+    local: LocalMaps,
+    meshes: Mapping[int, tuple[DepthMesh, Intersect]],
+    maps: CubeMaps,
+    rems: np.ndarray,
+    settings: Settings,
+) -> None:
+    """Give texels between the nodes of meshes whose points no map sees rays of their own: mostly a mesh has missed something.
+
+    Args:
+        meshes: By number of a local map; those of texels that get rays are changed.
+        scene, local, maps, rems, settings: As for `blend`. Statistics `local_retraced`: texels that got a ray.
+    """
+    state = local.state.numpy() if meshes else None
+    again = []
+    for k, (mesh, intersect) in meshes.items():
+        own = local.layout.texels(k)
+        texels = np.flatnonzero((state[own] == TEXEL_MISSING) & ~mesh.traced.reshape(-1)).astype(np.int32)
+        local.statistics[k]["local_retraced"] = len(texels)
+        if len(texels):
+            mesh.trace(texels, intersect)
+            put_mesh(local, k, mesh)
+            again.append(own.start + texels)
+    if again:
+        blend(scene, local, maps, rems, settings, np.concatenate(again).astype(np.int32))
+
+
+def put_mesh(local: LocalMaps, k: int, mesh: DepthMesh) -> None:
+    """Give local map k the depths of a mesh."""
+    first, device = int(local.layout.first_texel[k]), local.scene.device
+    for own, values, kind in ((local.inverse, mesh.inverse, float), (local.triangle, mesh.triangle, int)):
+        wp.copy(own, wp.array(values.reshape(-1), dtype=kind, device=device), dest_offset=first, count=values.size)
 
 
 def blend_local_map(
@@ -430,10 +424,7 @@ def blend_local_map(
     settings: Settings,
     slack: float = 0.0,
 ) -> tuple[CubeMaps, wp.array, dict[str, int]]:
-    """Colour the texels of a local map from reference maps.
-
-    A texel between the nodes of the mesh whose point no map sees gets a ray of its own first: mostly the mesh has missed
-    something there.
+    """One local map from the depths of a mesh.
 
     Args:
         scene: Of the maps.
@@ -446,104 +437,12 @@ def blend_local_map(
         slack: Length by which the depths may be off the surfaces (cells of a height field).
 
     Returns:
-        (One map; the state of its texels, uint8 [6 n n], a `TEXEL_...`; statistics `local_retraced`: texels that got a ray
-        although the mesh had none there, `rem_texels`: texels with a surface, `rem_missing`: those that no reference map
-        sees, `rem_shaded`: those of them that were shaded where they lie).
+        (One map; the state of its texels, uint8 [6 n n], a `TEXEL_...`; statistics `local_retraced`, and those of
+        `local_shading.shade`).
     """
-    device, threads, n = scene.device, settings.threads, mesh.inverse.shape[1]
-    local = empty_maps(scene, centre[None], np.eye(3)[None], n)
-    state = wp.empty(FACE_COUNT * n * n, dtype=wp.uint8, device=device)
-    eye = wp.vec3(*(centre - scene.origin))
-    chosen = wp.array(np.asarray(rems, np.int32), dtype=int, device=device)
-
-    by_blocks = vector.chosen(settings.kernels, device) and vector_fits(n, settings.rem_count, len(rems))
-
-    def blend(texels: np.ndarray | None) -> None:
-        local.view.triangle = wp.array(mesh.triangle.reshape(-1), dtype=int, device=device)
-        inverse = wp.array(mesh.inverse.reshape(-1), dtype=float, device=device)
-        light, looked_at = [scene.lights, maps.view, chosen, settings.rem_count, eye], [inverse, local.view.triangle]
-        knobs = [float(slack), settings.rem_blur_px, int(settings.rem_missing == "shade"), n]
-        outputs = [local.view.radiance, local.view.distance, state]
-        if texels is None and by_blocks:
-            from warp_reflect.techniques.local_map_vector import (
-                blend_blocks_kernel,
-            )  # which uses this module's functions
-
-            inputs = [scene.view, scene.triangle_records, *light, *knobs, *looked_at, *outputs]
-            vector.launch_blocks(blend_blocks_kernel, len(state), inputs, device, threads)
-            return
-        index = wp.array(np.zeros(0, np.int32) if texels is None else texels, dtype=int, device=device)
-        inputs = [scene.view, *light, *knobs, index, *looked_at, *outputs]
-        launch.launch(blend_kernel, len(state) if texels is None else len(texels), inputs, device, threads)
-
-    blend(None)
-    again = np.flatnonzero((state.numpy() == TEXEL_MISSING) & ~mesh.traced.reshape(-1)).astype(np.int32)
-    if len(again):
-        mesh.trace(again, intersect)
-        blend(again)
-    found = state.numpy()
-    missing = np.flatnonzero(found == TEXEL_MISSING)
-    statistics = {"local_retraced": len(again), "rem_texels": int((found != TEXEL_SKY).sum())}
-    statistics |= {"rem_missing": len(missing), "rem_shaded": 0}
-    if settings.rem_missing == "shade":
-        missing = missing[mesh.triangle.reshape(-1)[missing] >= 0]
-        statistics["rem_shaded"] = len(missing)
-        if len(missing):
-            shade_texels(scene, local, missing, settings)
-        found[missing] = TEXEL_SHADED
-        state = wp.array(found, dtype=wp.uint8, device=device)
-    return local, state, statistics
-
-
-def shade_texels(
-    scene: Scene, local: CubeMaps, texels: np.ndarray, settings: Settings, onward: Onward | None = None
-) -> None:
-    """Shade texels (flat indices) where they lie: at their distances, on their triangles; mirrors show what `onward` has.
-
-    Squares of `local_shade_step` texels that show one triangle share what one of them sees.
-    """
-    device, n = scene.device, local.resolution
-    shown, source = texels, np.zeros(0, np.int32)
-    if settings.local_shade_step > 1:
-        texels, source = _sharing(texels, local.view.triangle.numpy(), n, settings.local_shade_step)
-    count = len(texels)
-    texel = wp.array(texels.astype(np.int32), dtype=int, device=device)
-    point, direction = (wp.empty(count, dtype=wp.vec3, device=device) for _ in range(2))
-    u, v = (wp.empty(count, dtype=float, device=device) for _ in range(2))
-    triangle = wp.empty(count, dtype=int, device=device)
-    centre, axes = local.centres[0], local.axes[0]
-    eye = wp.vec3(*(centre - scene.origin))
-    inputs = [scene.view, eye, n, texel, local.view.distance, local.view.triangle, point, direction, triangle, u, v]
-    launch.launch(shaded_hits_kernel, count, inputs, device, settings.threads)
-    camera = face_camera(scene, centre, axes, 0, n)  # of any face: it tells the size of a texel
-    gbuffer = GBuffer(camera, camera.view(scene), triangle, u)
-    layer = hits_layer(point, direction, triangle, u, v)
-    radiance = shade.seen_radiance(
-        scene, gbuffer, layer, settings.threads, asked_shadows(scene, settings), settings.kernels
-    )
-    if onward is not None:
-        onward(gbuffer, layer, radiance)
-    shown, source = (wp.array(each.astype(np.int32), dtype=int, device=device) for each in (shown, source))
-    inputs = [shown, source, radiance, local.view.radiance]
-    launch.launch(put_radiance_kernel, len(shown), inputs, device, settings.threads)
-
-
-def _sharing(texels: np.ndarray, triangle: np.ndarray, n: int, step: int) -> tuple[np.ndarray, np.ndarray]:
-    """(Those of some texels that are shaded; for each the number, among these, of the one whose shading it shows)."""
-    own = np.arange(len(texels), dtype=np.int32)
-    place = np.full(FACE_COUNT * n * n, -1, np.int32)
-    place[texels] = own
-    asked = _middles(n, step)[texels]
-    other = place[asked]
-    other = np.where((other >= 0) & (triangle[asked] == triangle[texels]), other, own)
-    shaded = other == own
-    number = np.cumsum(shaded, dtype=np.int32) - 1
-    return texels[shaded], number[other]
-
-
-@cache
-def _middles(n: int, step: int) -> np.ndarray:
-    """For each texel of a map the middle one of its square, int32 [6 n n]."""
-    line = np.minimum(np.arange(n) // step * step + step // 2, n - 1)
-    face = np.arange(FACE_COUNT)[:, None, None] * n
-    return ((face + line[None, :, None]) * n + line[None, None, :]).reshape(-1).astype(np.int32)
+    local, rems = LocalMaps.empty(scene, centre, mesh.inverse.shape[1:2], slack), np.asarray(rems)[None]
+    put_mesh(local, 0, mesh)
+    blend(scene, local, maps, rems, settings)
+    blend_again(scene, local, {0: (mesh, intersect)}, maps, rems, settings)
+    local_shading.shade(scene, local, settings)
+    return *local.cube_map(0), local.statistics[0]

@@ -19,15 +19,17 @@ from warp_reflect.techniques.local_map import (
     PLANE_REACH,
     SLOPE_MAX,
     SLOPE_TEXELS,
-    TEXEL_BLENDED,
-    TEXEL_MISSING,
     WHOLE,
     blend_texel,
 )
+from warp_reflect.techniques.local_maps import ROW_MULTIPLE, LocalPlace
+from warp_reflect.techniques.local_shading import TEXEL_BLENDED, TEXEL_MISSING
 
 wp.set_module_options({"enable_backward": False})
 
 BLOCK = wp.constant(vector.BLOCK)
+ROWS = wp.constant(ROW_MULTIPLE)
+EVERY = wp.constant(wp.uint64(0xFFFFFFFFFFFFFFFF))  # texel of a block
 
 
 @wp.func_native(
@@ -35,9 +37,12 @@ BLOCK = wp.constant(vector.BLOCK)
         r"""
     typedef float Texel __attribute__((ext_vector_type(4)));
     const int begin = block * BLOCK;
+    const int n = place.resolution;
+    const int own = begin - place.first_texel;
     const int face_texels = n * n;
-    const int face = begin / face_texels;
-    const V e = spread(eye);
+    const int face = own / face_texels;
+    const float slack = place.slack;
+    const V e = spread(place.eye);
     const int count = rems.shape[0] < used ? rems.shape[0] : used;
     const int edge = maps.resolution;
     const float size_of_map = (float)(edge);
@@ -53,8 +58,9 @@ BLOCK = wp.constant(vector.BLOCK)
             __builtin_memset(out_state.data + start, 0, LANES);
             continue;
         }
-        const int row = (start - face * face_texels) / n;
-        const I column = start - face * face_texels - row * n + lanes();
+        const int of_face = start - place.first_texel - face * face_texels;
+        const int row = of_face / n;
+        const I column = of_face - row * n + lanes();
         const F u = (2.0f * __builtin_convertvector(column, F) + 1.0f) / (float)(n) - 1.0f;
         const F v = F((2.0f * (float)(row) + 1.0f) / (float)(n) - 1.0f);
         const F one = F(1.0f);
@@ -121,10 +127,10 @@ BLOCK = wp.constant(vector.BLOCK)
             const F a = pick(on_x, pick(behind, -d.z, d.z), pick(on_y, d.x, pick(behind, d.x, -d.x)));
             const F b = pick(on_y, pick(behind, d.z, -d.z), -d.y);
             const F over = __builtin_elementwise_abs(major);
-            const I of_face = ipick(on_x, I(0), ipick(on_y, I(2), I(4))) - behind;
+            const I its_face = ipick(on_x, I(0), ipick(on_y, I(2), I(4))) - behind;
             x[k] = 0.5f * (a / over + 1.0f) * size_of_map;
             y[k] = 0.5f * (b / over + 1.0f) * size_of_map;
-            where[k] = of_face * (edge * edge);
+            where[k] = its_face * (edge * edge);
             if (bits(good)) {
                 I cx = __builtin_convertvector(clip(pick(good, x[k], F(0.0f)), 0.0f, size_of_map - 1.0f), I);
                 I cy = __builtin_convertvector(clip(pick(good, y[k], F(0.0f)), 0.0f, size_of_map - 1.0f), I);
@@ -235,11 +241,9 @@ def blend_block(
     maps: CubeMapsView,
     rems: wp.array(dtype=int),
     used: int,
-    eye: wp.vec3,
-    slack: float,
+    place: LocalPlace,
     blur_max: float,
     shaded: int,
-    n: int,
     inverse: wp.array(dtype=float),
     triangle: wp.array(dtype=int),
     plane_reach: float,
@@ -266,13 +270,12 @@ def blend_blocks_kernel(
     records: wp.array(dtype=float),
     lights: LightView,
     maps: CubeMapsView,
-    rems: wp.array(dtype=int),
+    rems: wp.array2d(dtype=int),
     used: int,
-    eye: wp.vec3,
-    slack: float,
+    places: wp.array(dtype=LocalPlace),
+    block_map: wp.array(dtype=int),
     blur_max: float,
     shaded: int,
-    resolution: int,
     inverse: wp.array(dtype=float),
     triangle: wp.array(dtype=int),
     # Outputs:
@@ -280,36 +283,39 @@ def blend_blocks_kernel(
     out_distance: wp.array(dtype=float),
     out_state: wp.array(dtype=wp.uint8),
 ):
-    """One thread per block of texels."""
+    """One thread per block of texels, those of a row that is no whole number of vectors one by one."""
     block = first + wp.tid()
-    left = blend_block(
-        block,
-        records,
-        maps,
-        rems,
-        used,
-        eye,
-        slack,
-        blur_max,
-        shaded,
-        resolution,
-        inverse,
-        triangle,
-        PLANE_REACH,
-        AT_CENTRE,
-        COINCIDENT,
-        LEAST_WEIGHT,
-        SLOPE_MAX,
-        SLOPE_TEXELS,
-        DEPTH_SLACK,
-        WHOLE,
-        PALETTE,
-        TEXEL_BLENDED,
-        TEXEL_MISSING,
-        out_radiance,
-        out_distance,
-        out_state,
-    )
+    k = block_map[block]
+    place = places[k]
+    own = rems[k]
+    left = EVERY
+    if place.resolution % ROWS == 0:
+        left = blend_block(
+            block,
+            records,
+            maps,
+            own,
+            used,
+            place,
+            blur_max,
+            shaded,
+            inverse,
+            triangle,
+            PLANE_REACH,
+            AT_CENTRE,
+            COINCIDENT,
+            LEAST_WEIGHT,
+            SLOPE_MAX,
+            SLOPE_TEXELS,
+            DEPTH_SLACK,
+            WHOLE,
+            PALETTE,
+            TEXEL_BLENDED,
+            TEXEL_MISSING,
+            out_radiance,
+            out_distance,
+            out_state,
+        )
     i = block * BLOCK
     while left != wp.uint64(0):
         if (left & wp.uint64(1)) != wp.uint64(0):
@@ -317,13 +323,11 @@ def blend_blocks_kernel(
                 scene,
                 lights,
                 maps,
-                rems,
+                own,
                 used,
-                eye,
-                slack,
+                place,
                 blur_max,
                 shaded,
-                resolution,
                 i,
                 inverse,
                 triangle,

@@ -8,20 +8,22 @@ before (`environment_update` "previous"). A mirror's own vehicle is not in its m
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import warp as wp
 
 from warp_reflect import launch
 from warp_reflect.cubemap import FACE_COUNT, radiance_direction
-from warp_reflect.environment_maps import CubeMaps, Onward, copied_maps
+from warp_reflect.environment_maps import CubeMaps, Onward
 from warp_reflect.launch import FINITE_FLAGS
 from warp_reflect.scene import Scene
 from warp_reflect.settings import Settings
-from warp_reflect.techniques import local_map
+from warp_reflect.techniques import local_shading
 from warp_reflect.techniques.environment import vehicle_of
+from warp_reflect.techniques.local_maps import LocalMaps, LocalPlace
 
 # Directions and centres are finite: those of texels, and of bodies.
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FINITE_FLAGS})
@@ -32,6 +34,8 @@ TILE = wp.constant(8)  # texels along a side of the squares that are asked at on
 TILE_SPLIT_MIN = 64  # tiles
 SPHERE_SLACK = 1.0001  # of a part's radius: roundings hide nothing
 CONE_SLACK = wp.constant(1.0e-5)  # of the cosine between a tile and a part
+INSIDE = 4.0  # times the cosine of half a tile's angle, which is above 0.5, is more than the cosine of any angle
+MOVING = wp.constant(local_shading.TEXEL_MOVING)
 
 
 @dataclass
@@ -51,6 +55,11 @@ class Tree:
     number: np.ndarray
     part: np.ndarray
     fitted: wp.array | None = None
+
+    @cached_property
+    def on_device(self) -> wp.array:
+        """`number`, on the device."""
+        return wp.array(self.number.astype(np.int32), dtype=int, device=self.mesh.device)
 
 
 @dataclass
@@ -97,24 +106,42 @@ def texel_towards(tile_face: int, column: float, row: float, n: int) -> wp.vec3:
     return wp.normalize(radiance_direction(tile_face, u, v))
 
 
+@wp.struct
+class Asked:
+    """A moving part as a map sees it."""
+
+    part: int
+    towards: wp.vec3  # unit, to the middle of its sphere
+    near: float  # the least distance of what is in the sphere
+    cosine: float  # of half the angle that the sphere takes; -`INSIDE` where the eye is in it
+    sine: float
+
+
 @wp.kernel
 def moving_texels_kernel(
     first: int,
     mesh_id: wp.uint64,
-    group: wp.array(dtype=int),
-    sphere: wp.array(dtype=wp.vec4),
-    eye: wp.vec3,
-    resolution: int,
+    number: wp.array(dtype=int),
+    asked: wp.array(dtype=Asked),
+    asked_first: wp.array(dtype=int),
+    places: wp.array(dtype=LocalPlace),
+    tile_map: wp.array(dtype=int),
+    tile_first: wp.array(dtype=int),
     # Changed:
     out_distance: wp.array(dtype=float),
-    out_face: wp.array(dtype=int),
+    out_triangle: wp.array(dtype=int),
+    out_state: wp.array(dtype=wp.uint8),
 ):
     """One thread per tile of texels: the moving triangles before what the map holds there, and the distances to them.
 
     A part is asked, by a ray for every texel, where its sphere is in the tile's cone and nearer than the farthest that is there.
+    Those of map k are `asked_first[k]` to `asked_first[k + 1]`; `number` of a triangle of the tree is its own in the scene.
     """
     tile = first + wp.tid()
-    n = resolution
+    map_number = tile_map[tile]
+    place = places[map_number]
+    tile = tile - tile_first[map_number]
+    n = place.resolution
     tiles = (n + TILE - 1) / TILE
     face = tile / (tiles * tiles)
     top = (tile - face * tiles * tiles) / tiles
@@ -129,43 +156,83 @@ def moving_texels_kernel(
         y = wp.where(corner < 2, top, bottom)
         cosine = wp.min(cosine, wp.dot(axis, texel_towards(face, float(x), float(y), n)))
     sine = wp.sqrt(wp.max(1.0 - cosine * cosine, 0.0))
-    farthest = float(0.0)
-    row = top
-    while row < bottom:
-        column = left
-        while column < right:
-            reach = out_distance[(face * n + row) * n + column]
-            farthest = wp.max(farthest, wp.where(reach > 0.0, reach, FAR))
-            column += 1
-        row += 1
-    k = int(0)
-    while k < group.shape[0]:
-        towards = wp.vec3(sphere[k][0], sphere[k][1], sphere[k][2]) - eye
-        away = wp.length(towards)
-        radius = sphere[k][3]
-        asked = int(1)
-        if away > radius:
-            # The angle between both axes against the sum of both half angles.
-            part_sine = radius / away
-            least = cosine * wp.sqrt(1.0 - part_sine * part_sine) - sine * part_sine
-            if wp.dot(axis, towards) < (least - CONE_SLACK) * away or away - radius > farthest:
-                asked = 0
-        if asked == 1:
-            root = wp.mesh_get_group_root(mesh_id, group[k])
+    farthest = float(-1.0)
+    k = asked_first[map_number]
+    while k < asked_first[map_number + 1]:
+        # The angle between both axes against the sum of both half angles.
+        least = cosine * asked[k].cosine - sine * asked[k].sine - CONE_SLACK
+        if wp.dot(axis, asked[k].towards) >= least:
             row = top
-            while row < bottom:
+            while farthest < 0.0 and row < bottom:
                 column = left
                 while column < right:
-                    i = (face * n + row) * n + column
-                    reach = out_distance[i]
-                    ray = texel_towards(face, float(column) + 0.5, float(row) + 0.5, n)
-                    query = wp.mesh_query_ray(mesh_id, eye, ray, wp.where(reach > 0.0, reach, FAR), root)
-                    if query.result:
-                        out_face[i] = query.face
-                        out_distance[i] = wp.max(query.t, 1.0e-30)
+                    reach = out_distance[place.first_texel + (face * n + row) * n + column]
+                    farthest = wp.max(farthest, wp.where(reach > 0.0, reach, FAR))
                     column += 1
                 row += 1
+            if asked[k].near <= farthest:
+                root = wp.mesh_get_group_root(mesh_id, asked[k].part)
+                row = top
+                while row < bottom:
+                    column = left
+                    while column < right:
+                        i = place.first_texel + (face * n + row) * n + column
+                        reach = out_distance[i]
+                        ray = texel_towards(face, float(column) + 0.5, float(row) + 0.5, n)
+                        query = wp.mesh_query_ray(mesh_id, place.eye, ray, wp.where(reach > 0.0, reach, FAR), root)
+                        if query.result:
+                            out_triangle[i] = number[query.face]
+                            out_distance[i] = wp.max(query.t, 1.0e-30)
+                            out_state[i] = wp.uint8(MOVING)
+                        column += 1
+                    row += 1
         k += 1
+
+
+def meet_moving(scene: Scene, local: LocalMaps, parts: Sequence[tuple[int, ...]], settings: Settings) -> None:
+    """Put parts that move before what local maps hold, to be shaded.
+
+    Args:
+        scene: Of the maps.
+        local: Their faces along the axes of the world; changed.
+        parts: What each of them meets, see `moving_in`.
+        settings: `threads`.
+    """
+    movers, device = _movers(scene), scene.device
+    asked, asked_first = _asked(movers, local, parts)
+    if not len(asked):
+        return
+    made = wp.array(asked, dtype=Asked, device=device)
+    inputs = [wp.uint64(movers.id), movers.tree.on_device, made, wp.array(asked_first, dtype=int, device=device)]
+    tiles = FACE_COUNT * (-(-np.array(local.layout.resolutions) // int(TILE))) ** 2
+    tile_map = np.repeat(np.arange(len(tiles), dtype=np.int32), tiles)
+    tile_first = (np.cumsum(tiles) - tiles).astype(np.int32)
+    inputs += [local.places, *(wp.array(each, dtype=int, device=device) for each in (tile_map, tile_first))]
+    inputs += [local.distance, local.triangle, local.state]
+    launch.launch(moving_texels_kernel, len(tile_map), inputs, device, settings.threads, split_min=TILE_SPLIT_MIN)
+
+
+def _asked(movers: Movers, local: LocalMaps, parts: Sequence[tuple[int, ...]]) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of `Asked`, those of a map after one another, the nearest first; where each map's begin and the last ends."""
+    counts = [len(each) for each in parts]
+    numbers = np.array([k for each in parts for k in each], np.int64)
+    of_map = np.repeat(np.arange(len(parts)), counts)
+    rows = np.zeros(len(numbers), Asked.numpy_dtype())
+    first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
+    if len(numbers):
+        sphere = movers.spheres[[movers.row[k] for k in numbers.tolist()]].astype(np.float64)
+        towards = sphere[:, :3] - (local.centres - local.scene.origin)[of_map]
+        away, radius = np.linalg.norm(towards, axis=1), sphere[:, 3]
+        order = np.lexsort((away, of_map))
+        towards, away, radius = towards[order], away[order], radius[order]
+        outside = away > radius
+        sine = np.where(outside, radius / np.maximum(away, 1.0e-300), 0.0)
+        rows["part"] = numbers[order]
+        rows["towards"] = towards / np.maximum(away, 1.0e-300)[:, None]
+        rows["near"] = np.maximum(away - radius, 0.0)
+        # Around the eye: whatever the tile, the test is passed.
+        rows["cosine"], rows["sine"] = np.where(outside, np.sqrt(1.0 - sine * sine), -INSIDE), sine
+    return rows, first
 
 
 def draw_moving(
@@ -173,7 +240,7 @@ def draw_moving(
     local: CubeMaps,
     state: wp.array,
     parts: tuple[int, ...],
-    onward: Callable[[set[int]], Onward | None],
+    onward: Callable[[], Onward | None],
     settings: Settings,
 ) -> tuple[CubeMaps, wp.array, dict[str, int]]:
     """A local map with parts that move in front of what it holds.
@@ -183,33 +250,17 @@ def draw_moving(
         local: A map of all else, its faces along the axes of the world; it is not changed.
         state: Of its texels, see `local_map.blend_local_map`.
         parts: What is met, see `moving_in`.
-        onward: For the parts that are seen, what mirrors among them show; None: the domes.
+        onward: Where any is seen, what mirrors among them show; None: the domes.
         settings: `threads`, shadows.
 
     Returns:
         (The map; the state of its texels; statistics `local_moving`: texels that show what moves).
     """
-    movers, device, n = _movers(scene), scene.device, local.resolution
-    made = copied_maps(local)
-    made.view.distance = wp.clone(local.view.distance)
-    face = wp.full(len(local.view.distance), -1, dtype=int, device=device)
-    eye = wp.vec3(*(local.centres[0] - scene.origin))
-    groups = wp.array(parts, dtype=int, device=device)
-    spheres = wp.array(movers.spheres[[movers.row[k] for k in parts]], dtype=wp.vec4, device=device)
-    tiles = FACE_COUNT * (-(-n // int(TILE))) ** 2
-    inputs = [wp.uint64(movers.id), groups, spheres, eye, n, made.view.distance, face]
-    launch.launch(moving_texels_kernel, tiles, inputs, device, settings.threads, split_min=TILE_SPLIT_MIN)
-    met = face.numpy()
-    shown = np.flatnonzero(met >= 0)
-    if not len(shown):
-        return made, state, {"local_moving": 0}
-    triangle, of_state = local.view.triangle.numpy().copy(), state.numpy().copy()
-    triangle[shown] = movers.tree.number[met[shown]]
-    of_state[shown] = local_map.TEXEL_SHADED
-    made.view.triangle = wp.array(triangle, dtype=int, device=device)
-    seen = set(np.unique(movers.tree.part[met[shown]]).tolist())
-    local_map.shade_texels(scene, made, shown, settings, onward(seen))
-    return made, wp.array(of_state, dtype=wp.uint8, device=device), {"local_moving": len(shown)}
+    made = LocalMaps.empty(scene, local.centres[:1], [local.resolution])
+    made.put(0, local, state)
+    meet_moving(scene, made, [parts], settings)
+    local_shading.shade(scene, made, settings.replace(rem_missing="best"), onward)
+    return *made.cube_map(0), {"local_moving": made.statistics[0].get("local_moving", 0)}
 
 
 def take_over(earlier: Scene, scene: Scene) -> None:
