@@ -78,6 +78,23 @@ def test_swept_depths_are_those_of_rays_through_the_field(scene, up, edge):
     assert asked >= 4
 
 
+@pytest.mark.parametrize("up", ["Y", "Z"])
+@pytest.mark.parametrize("edge", [48, 33])
+def test_lines_side_by_side_are_swept_as_single_ones(scene, up, edge):
+    turned = Scene(dataclasses.replace(scene.data, up_axis=up), "cpu")
+    known = local_field.local_field(turned, SETTINGS)
+    low, high = turned.host_points.min(axis=0), turned.host_points.max(axis=0)
+    places = turned.origin + low + np.random.default_rng(9).uniform(0.05, 0.95, (12, 3)) * (high - low)
+    compared = 0
+    for place in places:
+        plain, vector = (swept(turned, known, place, edge, kernels) for kernels in ("plain", "auto"))
+        if plain[0] is not None:
+            np.testing.assert_array_equal(plain[0], vector[0])
+            np.testing.assert_array_equal(plain[1], vector[1])
+            compared += 1
+    assert compared >= 4
+
+
 def test_a_place_in_a_house_or_beyond_the_columns_has_no_field(scene):
     known = local_field.local_field(scene, SETTINGS)
     house = next(part for part in scene.parts if part.prim_path.endswith("House0L"))

@@ -32,7 +32,8 @@ ROWS = {
     "layered_environment": (
         "environment_maps",
         "techniques.layered_environment",
-        "techniques.local_shading",
+        "|techniques.local_shading_vector",
+        "-techniques.local_shading",
         "-techniques.local_map",
     ),
     "raytraced": ("bvh", "|bvh_vector"),

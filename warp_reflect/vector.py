@@ -205,14 +205,17 @@ _HEAD = r"""
 """
 
 
-def snippet(body: str, elsewhere: str = "", wide: bool = False) -> str:
+def snippet(body: str, elsewhere: str = "", wide: bool = False, exact: bool = False) -> str:
     """The text of a native function: `body` after the shared head on a CPU, `elsewhere` for CUDA (never launched there).
 
     Args:
+        exact: Products and sums are rounded one by one, as those of plain kernels are: the same bits.
         wide: 16 lanes whatever the processor has: two vectors of eight go side by side where every operation waits for the
             one before it.
     """
     head = _HEAD.replace("#if defined(__AVX512F__)", "#if 1") if wide else _HEAD
+    if exact:
+        head = "#pragma clang fp contract(off)\n" + head
     return f"#if !defined(__CUDACC_RTC__) && !defined(__CUDA_ARCH__)\n{head}{body}\n#else\n{elsewhere}\n#endif\n"
 
 

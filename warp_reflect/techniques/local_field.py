@@ -40,6 +40,7 @@ LEAST_HEIGHT = wp.constant(1.0e-6)  # cells over a roof: less is this
 OPEN_SLACK = wp.constant(0.05)  # share of a slope: the corner of a roof may rise between two lines
 HOLE_BELOW = 1.0  # cells below a top that a wall beside a hole is taken to reach
 SPLIT_MIN = 32  # lines; a walk takes 2 to 20 us
+GROUP_SPLIT_MIN = 8  # groups of them
 GROUP_LINES = wp.constant(LINES)
 STEEP_BLOCK = wp.constant(vector.BLOCK)
 COLUMN_SIDES = 4  # towards lower and higher x, then y
@@ -462,6 +463,16 @@ def sweep(scene: Scene, known: LocalField, maps: LocalMaps, settings: Settings) 
     origin, outputs = wp.vec3(*(scene.origin - known.origin)), [maps.inverse, maps.triangle]
     inputs = [view, known.sides, faces, maps.places, where.group_map, origin, *outputs, open_from]
     threads = settings.threads
+    steep_inputs = [view, known.sides, faces, open_from, maps.places, where.steep_map, origin, steep, *outputs]
+    if vector.chosen(settings.kernels, device):
+        from warp_reflect.techniques import local_field_vector  # which uses this module's functions
+
+        groups, blocks = len(where.group_map), len(where.steep_map)
+        launch.launch(
+            local_field_vector.sweep_groups_kernel, groups, inputs, device, threads, split_min=GROUP_SPLIT_MIN
+        )
+        kernel = local_field_vector.trace_steep_blocks_kernel
+        launch.launch(kernel, blocks, steep_inputs, device, threads, split_min=vector.BLOCK_SPLIT_MIN)
+        return
     launch.launch(sweep_lines_kernel, lines, inputs, device, threads, split_min=SPLIT_MIN)
-    inputs = [view, known.sides, faces, open_from, maps.places, where.steep_map, origin, steep, *outputs]
-    launch.launch(trace_steep_kernel, len(where.steep_map) * vector.BLOCK, inputs, device, threads)
+    launch.launch(trace_steep_kernel, len(where.steep_map) * vector.BLOCK, steep_inputs, device, threads)

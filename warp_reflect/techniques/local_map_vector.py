@@ -181,22 +181,37 @@ EVERY = wp.constant(wp.uint64(0xFFFFFFFFFFFFFFFF))  # texel of a block
             const int l = __builtin_ctz(rest);
             *(Texel*)(radiance + 4 * (start + l)) = Texel(0.0f);
         }
-        for (unsigned rest = bits(need); rest != 0; rest &= rest - 1) {
+        // environment_maps.fetch_level, of looks-up that stay within a face.
+        I there_of[2] = {I(0), I(0)}, beyond = I(0);
+        float weight[2][LANES], shares[2][4][LANES];
+        int first_tap[2][LANES];
+        for (int k = 0; k < count; ++k) {
+            const F px = x[k] - 0.5f, py = y[k] - 0.5f;
+            const I asked = need & (w[k] > 0.0f);
+            const I inside = (px >= 0.0f) & (py >= 0.0f) & (px < size_of_map - 1.0f) & (py < size_of_map - 1.0f)
+                & (square[k] > 0.0f);
+            there_of[k] = asked & inside;
+            beyond |= asked & ~inside;
+            const F in_x = pick(there_of[k], px, F(0.0f)), in_y = pick(there_of[k], py, F(0.0f));
+            const I x0 = __builtin_convertvector(in_x, I), y0 = __builtin_convertvector(in_y, I);
+            const F fx = in_x - __builtin_convertvector(x0, F), fy = in_y - __builtin_convertvector(y0, F);
+            istore(first_tap[k], rems.data[k] * maps.map_texels + where[k] + y0 * edge + x0);
+            store(weight[k], w[k]);
+            store(shares[k][0], (1.0f - fx) * (1.0f - fy));
+            store(shares[k][1], fx * (1.0f - fy));
+            store(shares[k][2], (1.0f - fx) * fy);
+            store(shares[k][3], fx * fy);
+        }
+        const unsigned of_first = bits(there_of[0]), of_second = bits(there_of[1]);
+        unsigned left_over = bits(beyond);
+        for (unsigned rest = bits(need) & ~left_over; rest != 0; rest &= rest - 1) {
             const int l = __builtin_ctz(rest);
             Texel sum = Texel(0.0f);
             bool whole = true;
-            for (int k = 0; k < count && whole; ++k) {
-                if (!(w[k][l] > 0.0f)) continue;
-                const float px = x[k][l] - 0.5f, py = y[k][l] - 0.5f;
-                if (!(px >= 0.0f && py >= 0.0f && px < size_of_map - 1.0f && py < size_of_map - 1.0f && square[k][l] > 0.0f)) {
-                    whole = false;
-                    break;
-                }
-                const int x0 = (int)(px), y0 = (int)(py);
-                const float fx = px - (float)(x0), fy = py - (float)(y0);
-                const int at = rems.data[k] * maps.map_texels + where[k][l] + y0 * edge + x0;
+            for (int k = 0; k < count; ++k) {
+                if (((k == 0 ? of_first : of_second) >> l & 1) == 0) continue;
+                const int at = first_tap[k][l];
                 const int taps[4] = {at, at + 1, at + edge, at + edge + 1};
-                const float shares[4] = {(1.0f - fx) * (1.0f - fy), fx * (1.0f - fy), (1.0f - fx) * fy, fx * fy};
                 Texel value = Texel(0.0f);
                 for (int tap = 0; tap < 4; ++tap) {
                     Texel one_tap;
@@ -217,18 +232,19 @@ EVERY = wp.constant(wp.uint64(0xFFFFFFFFFFFFFFFF))  # texel of a block
                     } else {
                         __builtin_memcpy(&one_tap, (const float*)maps.radiance.data + 4 * (long long)taps[tap], sizeof(one_tap));
                     }
-                    value += shares[tap] * one_tap;
+                    value += shares[k][tap][l] * one_tap;
                 }
-                whole = value.w >= whole_coverage;
-                sum += w[k][l] * value;
+                whole &= value.w >= whole_coverage;
+                sum += weight[k][l] * value;
             }
             if (!whole) {
-                unanswered |= 1ull << (start - begin + l);
+                left_over |= 1u << l;
                 continue;
             }
             sum.w = 1.0f;
             __builtin_memcpy(radiance + 4 * (start + l), &sum, sizeof(sum));
         }
+        unanswered |= (unsigned long long)left_over << (start - begin);
     }
     return unanswered;
 """,

@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 import warp as wp
 
-from warp_reflect import launch
+from warp_reflect import launch, vector
 from warp_reflect.cubemap import FACE_COUNT, radiance_direction
 from warp_reflect.environment_maps import CubeMaps, Onward
 from warp_reflect.launch import FINITE_FLAGS
@@ -117,6 +117,57 @@ class Asked:
     sine: float
 
 
+@wp.struct
+class Tile:
+    """Neighbouring texels of a face, columns left to right - 1 and rows top to bottom - 1, and the cone of their rays."""
+
+    face: int
+    left: int
+    top: int
+    right: int
+    bottom: int
+    axis: wp.vec3
+    cosine: float  # of half its angle
+    sine: float
+
+
+@wp.func
+def tile_of(place: LocalPlace, number: int) -> Tile:
+    """Tile of a map."""
+    n = place.resolution
+    tiles = (n + TILE - 1) / TILE
+    tile = Tile()
+    tile.face = number / (tiles * tiles)
+    row = (number - tile.face * tiles * tiles) / tiles
+    tile.left = (number - (tile.face * tiles + row) * tiles) * TILE
+    tile.top = row * TILE
+    tile.right = wp.min(tile.left + TILE, n)
+    tile.bottom = wp.min(tile.top + TILE, n)
+    tile.axis = texel_towards(tile.face, 0.5 * float(tile.left + tile.right), 0.5 * float(tile.top + tile.bottom), n)
+    tile.cosine = 1.0
+    for corner in range(4):
+        x = wp.where(corner % 2 == 0, tile.left, tile.right)
+        y = wp.where(corner < 2, tile.top, tile.bottom)
+        tile.cosine = wp.min(tile.cosine, wp.dot(tile.axis, texel_towards(tile.face, float(x), float(y), n)))
+    tile.sine = wp.sqrt(wp.max(1.0 - tile.cosine * tile.cosine, 0.0))
+    return tile
+
+
+@wp.func
+def farthest_in(place: LocalPlace, tile: Tile, distance: wp.array(dtype=float)) -> float:
+    """How far away the farthest is that a map holds in a tile."""
+    farthest = float(0.0)
+    row = tile.top
+    while row < tile.bottom:
+        column = tile.left
+        while column < tile.right:
+            reach = distance[place.first_texel + (tile.face * place.resolution + row) * place.resolution + column]
+            farthest = wp.max(farthest, wp.where(reach > 0.0, reach, FAR))
+            column += 1
+        row += 1
+    return farthest
+
+
 @wp.kernel
 def moving_texels_kernel(
     first: int,
@@ -137,48 +188,28 @@ def moving_texels_kernel(
     A part is asked, by a ray for every texel, where its sphere is in the tile's cone and nearer than the farthest that is there.
     Those of map k are `asked_first[k]` to `asked_first[k + 1]`; `number` of a triangle of the tree is its own in the scene.
     """
-    tile = first + wp.tid()
-    map_number = tile_map[tile]
+    number_of_tile = first + wp.tid()
+    map_number = tile_map[number_of_tile]
     place = places[map_number]
-    tile = tile - tile_first[map_number]
+    tile = tile_of(place, number_of_tile - tile_first[map_number])
     n = place.resolution
-    tiles = (n + TILE - 1) / TILE
-    face = tile / (tiles * tiles)
-    top = (tile - face * tiles * tiles) / tiles
-    left = (tile - (face * tiles + top) * tiles) * TILE
-    top = top * TILE
-    right = wp.min(left + TILE, n)
-    bottom = wp.min(top + TILE, n)
-    axis = texel_towards(face, 0.5 * float(left + right), 0.5 * float(top + bottom), n)
-    cosine = float(1.0)
-    for corner in range(4):
-        x = wp.where(corner % 2 == 0, left, right)
-        y = wp.where(corner < 2, top, bottom)
-        cosine = wp.min(cosine, wp.dot(axis, texel_towards(face, float(x), float(y), n)))
-    sine = wp.sqrt(wp.max(1.0 - cosine * cosine, 0.0))
     farthest = float(-1.0)
     k = asked_first[map_number]
     while k < asked_first[map_number + 1]:
         # The angle between both axes against the sum of both half angles.
-        least = cosine * asked[k].cosine - sine * asked[k].sine - CONE_SLACK
-        if wp.dot(axis, asked[k].towards) >= least:
-            row = top
-            while farthest < 0.0 and row < bottom:
-                column = left
-                while column < right:
-                    reach = out_distance[place.first_texel + (face * n + row) * n + column]
-                    farthest = wp.max(farthest, wp.where(reach > 0.0, reach, FAR))
-                    column += 1
-                row += 1
+        least = tile.cosine * asked[k].cosine - tile.sine * asked[k].sine - CONE_SLACK
+        if wp.dot(tile.axis, asked[k].towards) >= least:
+            if farthest < 0.0:
+                farthest = farthest_in(place, tile, out_distance)
             if asked[k].near <= farthest:
                 root = wp.mesh_get_group_root(mesh_id, asked[k].part)
-                row = top
-                while row < bottom:
-                    column = left
-                    while column < right:
-                        i = place.first_texel + (face * n + row) * n + column
+                row = tile.top
+                while row < tile.bottom:
+                    column = tile.left
+                    while column < tile.right:
+                        i = place.first_texel + (tile.face * n + row) * n + column
                         reach = out_distance[i]
-                        ray = texel_towards(face, float(column) + 0.5, float(row) + 0.5, n)
+                        ray = texel_towards(tile.face, float(column) + 0.5, float(row) + 0.5, n)
                         query = wp.mesh_query_ray(mesh_id, place.eye, ray, wp.where(reach > 0.0, reach, FAR), root)
                         if query.result:
                             out_triangle[i] = number[query.face]
@@ -196,7 +227,7 @@ def meet_moving(scene: Scene, local: LocalMaps, parts: Sequence[tuple[int, ...]]
         scene: Of the maps.
         local: Their faces along the axes of the world; changed.
         parts: What each of them meets, see `moving_in`.
-        settings: `threads`.
+        settings: `threads`, `kernels`.
     """
     movers, device = _movers(scene), scene.device
     asked, asked_first = _asked(movers, local, parts)
@@ -209,7 +240,12 @@ def meet_moving(scene: Scene, local: LocalMaps, parts: Sequence[tuple[int, ...]]
     tile_first = (np.cumsum(tiles) - tiles).astype(np.int32)
     inputs += [local.places, *(wp.array(each, dtype=int, device=device) for each in (tile_map, tile_first))]
     inputs += [local.distance, local.triangle, local.state]
-    launch.launch(moving_texels_kernel, len(tile_map), inputs, device, settings.threads, split_min=TILE_SPLIT_MIN)
+    kernel = moving_texels_kernel
+    if vector.chosen(settings.kernels, device):
+        from warp_reflect.techniques import local_movers_vector  # which uses this module's structures
+
+        kernel = local_movers_vector.moving_tiles_kernel
+    launch.launch(kernel, len(tile_map), inputs, device, settings.threads, split_min=TILE_SPLIT_MIN)
 
 
 def _asked(movers: Movers, local: LocalMaps, parts: Sequence[tuple[int, ...]]) -> tuple[np.ndarray, np.ndarray]:

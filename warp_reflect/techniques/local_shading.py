@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 import warp as wp
 
-from warp_reflect import launch
+from warp_reflect import launch, vector
 from warp_reflect import shade as shading
 from warp_reflect.cubemap import FACE_COUNT
 from warp_reflect.environment_maps import Onward, face_camera, hits_layer
@@ -227,8 +227,15 @@ def shade(
     counts = wp.empty((COUNTED, rows), dtype=int, device=device)
     at = [local.places, where.row_map]
     ask = [*at, step, missing]
+    count_kernel, hits_kernel, put_kernel = count_asked_kernel, shaded_hits_kernel, put_radiance_kernel
+    by_rows = vector.chosen(settings.kernels, device)
+    if by_rows:
+        from warp_reflect.techniques import local_shading_vector as rows_of  # which uses this module's constants
+
+        count_kernel, hits_kernel = rows_of.count_rows_kernel, rows_of.hits_of_rows_kernel
+        put_kernel = rows_of.put_rows_kernel
     inputs = [*ask, local.triangle, local.state, counts]
-    launch.launch(count_asked_kernel, rows, inputs, device, threads, split_min=ROW_SPLIT_MIN)
+    launch.launch(count_kernel, rows, inputs, device, threads, split_min=ROW_SPLIT_MIN)
     counted = counts.numpy()
     totals = np.add.reduceat(counted, where.first_row, axis=1)
     for k, (surfaces, unseen, asked, moving, _) in enumerate(totals.T.tolist()):
@@ -244,8 +251,9 @@ def shade(
     point, direction = (wp.empty(count, dtype=wp.vec3, device=device) for _ in range(2))
     u, v = (wp.empty(count, dtype=float, device=device) for _ in range(2))
     hits = [point, direction, triangle, u, v]
-    inputs = [scene.view, *ask, counts, row_first, local.distance, local.triangle, local.state, number, pixel, *hits]
-    launch.launch(shaded_hits_kernel, rows, inputs, device, threads, split_min=ROW_SPLIT_MIN)
+    inputs = [scene.triangle_records if by_rows else scene.view, *ask, counts, row_first]
+    inputs += [local.distance, local.triangle, local.state, number, pixel, *hits]
+    launch.launch(hits_kernel, rows, inputs, device, threads, split_min=ROW_SPLIT_MIN)
     shadows = asked_shadows(scene, settings)
     change = onward() if onward is not None and totals[int(MOVING)].any() else None
     if _asks_no_eye(scene, shadows):
@@ -261,7 +269,7 @@ def shade(
                 wp.copy(radiance, found, dest_offset=begin, count=end - begin)
             begin = end
     inputs = [*at, counts, number, radiance, local.radiance, local.state]
-    launch.launch(put_radiance_kernel, rows, inputs, device, threads, split_min=ROW_SPLIT_MIN)
+    launch.launch(put_kernel, rows, inputs, device, threads, split_min=ROW_SPLIT_MIN)
 
 
 def _asks_no_eye(scene: Scene, shadows: Shadows | None) -> bool:
