@@ -1,14 +1,17 @@
 """What a plan decides, and why: every decision with its measured value, its threshold and the setting that moves it."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
 from rooms import CHROME, identical, placed, plane_room, render, room, sphere
 
 import warp_reflect as wr
-from warp_reflect import launch, probe
-from warp_reflect.scene import MirrorData, Scene
+from warp_reflect import bvh, launch, planner, probe
+from warp_reflect.layers import ReflectionLayer
+from warp_reflect.scene import LightData, MirrorData, Scene
+from warp_reflect.settings import Technique
 
 SIZE = (160, 90)
 
@@ -121,15 +124,68 @@ def test_the_same_asked_again_is_decided_by_nothing_new(ball_room):
 def test_small_mirrors_are_tried_at_points_of_their_own():
     pixel = np.sort(np.random.default_rng(5).choice(10000, 4000, replace=False)).astype(np.int32)
     grid = np.arange(3, 10000, 7, dtype=np.int32)
-    place, on_grid = probe._some(pixel, grid)
+    place, on_grid = probe._some(pixel, np.intersect1d(pixel, grid))
     assert np.array_equal(pixel[place], np.intersect1d(pixel, grid)) and on_grid.all()
     few = pixel[:300]
-    place, on_grid = probe._some(few, grid)
+    place, on_grid = probe._some(few, np.intersect1d(few, grid))
     assert len(place) >= probe.LEAST_TRIED and (np.diff(place) > 0).all()
     assert np.array_equal(few[place[on_grid]], np.intersect1d(few, grid))
-    place, _ = probe._some(pixel[:5], grid)
+    place, _ = probe._some(pixel[:5], np.intersect1d(pixel[:5], grid))
     assert np.array_equal(place, np.arange(5)), "all of fewer"
-    assert not len(probe._some(pixel[:0], grid)[0])
+    assert not len(probe._some(pixel[:0], grid[:0])[0])
+
+
+def test_mirrors_that_are_tried_together_show_what_each_shows_alone(device):
+    """A mirror before another, and an open bowl that sees itself and what its back is left by."""
+    stage = Path(__file__).parent.parent / "usd_scenes"
+    for name in ("two_spheres", "open_bowl", "facing_mirrors"):
+        scene = wr.load_stage(stage / f"{name}.usda", device=str(device))
+        plan = wr.make_plan(scene, size=(320, 180))
+        parts = {row.reflector.id: row.reflector.part for row in plan.rows}
+        together = probe.probe(scene, probe.look(scene, plan.camera, parts))
+        assert together.mirrored
+        for id, part in parts.items():
+            seen = probe.look(scene, plan.camera, parts)
+            layer = bvh_layer(scene, seen, id, part)
+            pixel = seen.pixels[id].pixel.numpy()
+            stride = 320 // probe.TRIED_SIDE | 1
+            row, column = pixel // 320, pixel % 320
+            grid = pixel[(row % stride == stride // 2) & (column % stride == stride // 2)]
+            shown = layer.triangle.numpy()[probe._some(pixel, grid)[0]]
+            patch = scene.host_triangle_patch[shown[shown >= 0]]
+            for other in parts.values():
+                share = np.isin(patch, list(scene.parts[other].patches)).sum() / max(len(shown), 1)
+                assert together.mirrored.get(part, {}).get(other, 0.0) == pytest.approx(share)
+
+
+def bvh_layer(scene, seen, id, part):
+    layer = ReflectionLayer.empty(seen.pixels[id], Technique.RAYTRACED, scene.device)
+    bvh.trace_pixels(scene, seen.gbuffer, layer.pixels, layer, part, False)
+    return layer
+
+
+def lit(lights, device, **more):
+    data = room(sphere(), placed(0, 0, 0)).data
+    return Scene(dataclasses.replace(data, lights=lights), device), {
+        "size": (320, 180),
+        "settings": wr.Settings(**more),
+    }
+
+
+def test_few_points_decide_what_is_clear_and_all_decide_the_rest(device, monkeypatch):
+    spacings = []
+    tried = probe.probe
+    monkeypatch.setattr(planner, "probe", lambda *given: spacings.append(given[-1]) or tried(*given))
+    high = LightData("/sun", "distant", (2.0, 2.0, 2.0), placed(0, 0, 0))
+    high.world_from_light[:3, :3] = [[1, 0, 0], [0, 0.6, 0.8], [0, -0.8, 0.6]]
+    scene, asked = lit([high], device)
+    numbers = wr.make_plan(scene, **asked).lights[0].effects["shadows"].numbers
+    assert spacings == [2] and numbers["taken"] > 10.0 * numbers["threshold"]
+    taken = numbers["taken"]
+    spacings.clear()
+    scene, asked = lit([high], device, shadow_min_share=0.5)
+    numbers = wr.make_plan(scene, **asked).lights[0].effects["shadows"].numbers
+    assert spacings == [2, 1] and numbers["taken"] == pytest.approx(taken, abs=0.03)  # two deviations of 460 points
 
 
 def test_one_setting_changed_on_a_still_scene_draws_the_same_pixels_anew(ball_room):

@@ -675,6 +675,7 @@ def trace_pixels(
     index: wp.array | None = None,
     threads: int = 0,
     kernels: str = "auto",
+    meets_own: bool = False,
 ) -> int:
     """Follow the reflected rays of mirror pixels through the BVH and write their hits into the layer.
 
@@ -688,6 +689,7 @@ def trace_pixels(
         index: int32, which of the pixels, each at most once; None: all.
         threads: CPU threads; 0: one per core.
         kernels: `Settings.kernels`.
+        meets_own: The mirror is met like anything else, but for the facet that a ray starts on.
 
     Returns:
         The number of pixels asked.
@@ -703,7 +705,7 @@ def trace_pixels(
         pixels.point,
         pixels.normal,
         pixels.direction,
-        body_of(scene, part, convex),
+        body_of(scene, -1 if meets_own else part, convex),
         pixels.pixel if index is None else index,
         int(index is not None),
     ]

@@ -321,8 +321,8 @@ def points_of(
         return Points(layer.triangle, layer.u, layer.v, pixels.direction, pixels.pixel, *size)
     triangle, pixel = gbuffer.triangle, wp.zeros(0, dtype=int, device=device)
     if chosen is not None:
-        triangle = wp.array(triangle.numpy()[chosen], dtype=int, device=device)
-        pixel = wp.array(chosen, dtype=int, device=device)
+        triangle = wp.array(triangle.numpy()[chosen], dtype=int, device=device, copy=False)
+        pixel = wp.array(chosen, dtype=int, device=device, copy=False)
     direction = wp.zeros(len(triangle), dtype=wp.vec3, device=device)
     u, v = (wp.zeros(len(triangle), dtype=float, device=device) for _ in range(2))
     inputs = [scene.view, gbuffer.view, triangle, pixel, direction, u, v]

@@ -75,7 +75,7 @@ def of_view(settings: Settings, device: wp.DeviceLike, casting: bool = False, mi
 
 def of_mirrors(settings: Settings, device: wp.DeviceLike, casting: bool) -> list[str]:
     """Those that planning launches once mirrors are seen; `casting` as for `of_view`."""
-    asked = ["|surface_vector", "-surface/plain", *(["bvh", "|bvh_vector"] if casting else [])]
+    asked = ["|surface_vector", "-surface/plain", *(["bvh"] if casting else [])]
     return _of(asked, vectors(settings, device))
 
 

@@ -18,6 +18,9 @@ from warp_reflect.shadows import Shadows, first_count, light_shares, shared_coun
 
 REC709_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 PROBE_SAMPLES = 4  # rays to a shape from each point that is tried
+# Of `shadow_min_share`: what the shadows of a light clearly take that few points tell of. Of 600 points one that takes no more
+# than the share itself shows so much once in a million.
+CLEAR = 10.0
 # More rays are sent where the first ones of 5 x 5 pixels part; the points tried tell where `PROBE_SAMPLES` do. Where any share of
 # a shape is as likely to be seen, n rays part with probability 1 - 2 / (n + 1).
 MORE_PARTED = (1.0 - 2.0 / (25.0 + 1.0)) / (1.0 - 2.0 / (PROBE_SAMPLES + 1.0))
@@ -88,6 +91,13 @@ def needs_probe(scene: Scene, settings: Settings) -> bool:
     return settings.shadows == "auto" and casting and scene.triangle_count > 0
 
 
+def are_clear(rows: list[LightRow], settings: Settings) -> bool:
+    """Whether few points tell of every light that it casts shadows into view."""
+    numbers = [row.effects["shadows"].numbers for row in rows]
+    least = CLEAR * settings.shadow_min_share
+    return all(each["taken"] > 0.0 and each["taken"] >= least for each in numbers if "taken" in each)
+
+
 @dataclass(frozen=True)
 class _Tried:
     """A light at the points that were tried."""
@@ -100,11 +110,10 @@ class _Tried:
 
 
 def _tried(scene: Scene, probe: Probe, settings: Settings) -> list[_Tried]:
+    """Every light at the points of a probe, the distant ones first."""
     normal, unshadowed, arrived = light_shares(scene, probe.points, PROBE_SAMPLES, settings.threads, settings.kernels)
-    there = probe.points.triangle.numpy() >= 0
-    brought = (unshadowed.astype(np.float64) @ REC709_LUMINANCE)[there]
-    arrived = arrived[there].astype(np.float64)
-    sky = shade.dome_irradiances(scene, normal[there], settings.threads).astype(np.float64) @ REC709_LUMINANCE
+    brought, arrived = unshadowed.astype(np.float64) @ REC709_LUMINANCE, arrived.astype(np.float64)
+    sky = shade.dome_irradiances(scene, normal, settings.threads).astype(np.float64) @ REC709_LUMINANCE
     total = max(float(brought.sum() + sky.sum()), 1.0e-300)
     result = []
     for k in range(brought.shape[1]):

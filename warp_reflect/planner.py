@@ -7,6 +7,8 @@ import difflib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from warp_reflect import (
     __version__,
     applicable,
@@ -31,7 +33,7 @@ from warp_reflect.effects import (
 )
 from warp_reflect.launch import thread_count
 from warp_reflect.layers import Camera, GBuffer, Reflector
-from warp_reflect.lighting import LightRow, needs_probe, plan_lights, shadows_of
+from warp_reflect.lighting import LightRow, are_clear, needs_probe, plan_lights, shadows_of
 from warp_reflect.probe import EyeView, Probe, look, probe
 from warp_reflect.reflectors import interface_of, is_transparent, mirror_roughness, mirror_weight
 from warp_reflect.scene import Note, PartRange, Scene
@@ -397,8 +399,8 @@ def make_plan(
     found, clear, rough = _surfaces(scene, settings)
     if method == "none":
         found = []
-    pixels, tried, seen = _look(scene, view, [k for k, _, _ in found], clear, settings)
-    lights = plan_lights(scene, tried, settings, costs)
+    pixels, seen = _look(scene, view, [k for k, _, _ in found], clear, settings)
+    tried, lights = _tried(scene, seen, pixels, [k for k, _, _ in found], settings, costs)
     # What techniques draw themselves is shadowed where the picture is.
     cast = shadows_of(lights, settings)
     drawn = settings.replace(shadows=cast is not None and cast.direct)
@@ -604,26 +606,42 @@ def find_camera(scene: Scene, camera: str | Camera | None, size: tuple[int, int]
 
 def _look(
     scene: Scene, camera: Camera, mirrors: list[int], panes: list[int], settings: Settings
-) -> tuple[dict[int, int], Probe | None, EyeView | None]:
-    """(pixels of each part; what lights and bounces are decided by, if they are; what the camera sees, if it was drawn)."""
+) -> tuple[dict[int, int], EyeView | None]:
+    """(pixels of each part; what the camera sees, if it was drawn)."""
     casting = needs_probe(scene, settings)
     if not scene.triangle_count or not (mirrors or panes or casting):
-        return dict.fromkeys([*mirrors, *panes], 0), None, None
+        return dict.fromkeys([*mirrors, *panes], 0), None
     kernels.begin(kernels.of_view(settings, scene.device, casting, bool(mirrors)), scene.device)
 
     def begin_mirrors(gbuffer: GBuffer) -> None:
         some = gbuffer.triangle.numpy()[::GLANCE]
-        patches = {k for part in mirrors for k in scene.parts[part].patches}
-        if patches & set(scene.host_triangle_patch[some[some >= 0]].tolist()):
+        is_mirror = np.zeros(len(scene.patch_shapes), bool)
+        for part in mirrors:
+            is_mirror[list(scene.parts[part].patches)] = True
+        if is_mirror[scene.host_triangle_patch[some[some >= 0]]].any():
             kernels.begin(kernels.of_mirrors(settings, scene.device, casting), scene.device)
 
     seen = look(scene, camera, dict(enumerate(mirrors, 1)), settings.threads, settings.kernels, begin_mirrors)
-    pixels = seen.pixels_of(scene, [*mirrors, *panes])
+    return seen.pixels_of(scene, [*mirrors, *panes]), seen
+
+
+def _tried(
+    scene: Scene, seen: EyeView | None, pixels: Mapping[int, int], mirrors: list[int], settings: Settings, costs: Costs
+) -> tuple[Probe | None, list[LightRow]]:
+    """(What is tried of what the camera sees, where lights or bounces are decided by that; the lights).
+
+    A quarter of the points is enough where every light clearly casts shadows and every mirror shows a mirror.
+    """
     clear = [k for k in mirrors if pixels[k] >= max(settings.few_pixels, 1)]
     facing = settings.bounces > 1 and (len(mirrors) > 1 or any(not scene.body(k).convex for k in clear))
-    if not (casting or facing):
-        return pixels, None, seen
-    return pixels, probe(scene, seen, settings.threads, settings.kernels), seen
+    if seen is None or not (needs_probe(scene, settings) or facing):
+        return None, plan_lights(scene, None, settings, costs)
+    for spacing in (2, 1):
+        tried = probe(scene, seen, settings.threads, spacing)
+        lights = plan_lights(scene, tried, settings, costs)
+        if are_clear(lights, settings) and (not facing or all(tried.mirrored.values())):
+            break
+    return tried, lights
 
 
 def _row(scene, camera, settings, method, number, part_index, part, weight, pixels, notes, costs) -> PlanRow:

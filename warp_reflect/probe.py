@@ -10,7 +10,7 @@ import warp as wp
 
 from warp_reflect import bvh, raster, surface
 from warp_reflect.direct import Points, points_of
-from warp_reflect.layers import Camera, GBuffer, MirrorPixels, ReflectionLayer
+from warp_reflect.layers import NO_REFLECTOR, Camera, GBuffer, MirrorPixels, ReflectionLayer
 from warp_reflect.scene import Scene
 from warp_reflect.settings import Technique
 from warp_reflect.timing import StageTimer
@@ -87,54 +87,112 @@ def look(
     return EyeView(gbuffer, pixels, dict(parts), timer.ms)
 
 
-def probe(scene: Scene, seen: EyeView, threads: int = 0, kernels: str = "auto") -> Probe:
+def probe(scene: Scene, seen: EyeView, threads: int = 0, spacing: int = 1) -> Probe:
     """Try points on a coarse grid of what is seen, and what mirrors show there.
 
     Args:
         scene: Its BVH is built if there are mirrors and this is the first use.
         seen: Of the scene.
         threads: CPU threads; 0: one per core.
-        kernels: `Settings.kernels`.
+        spacing: Of the grid; 2: a quarter of the points.
     """
     gbuffer = seen.gbuffer
     width, height = gbuffer.camera.size
-    stride = max(width, height) // TRIED_SIDE | 1  # odd, so that it falls in step with few patterns
+    stride = spacing * (max(width, height) // TRIED_SIDE) | 1  # odd, so that it falls in step with few patterns
     rows, columns = (np.arange(stride // 2, side, stride) for side in (height, width))
     chosen = (rows[:, None] * width + columns).ravel().astype(np.int32)
-    triangle = gbuffer.triangle.numpy()
-    there = triangle[chosen] >= 0
+    there = gbuffer.triangle.numpy()[chosen] >= 0
+    count = width * height * float(there.mean())
     points = points_of(scene, gbuffer, None, threads, chosen[there])
     found = [_taken(points, slice(None))]
-    count = width * height * float(there.mean())
     mirrored: dict[int, dict[int, float]] = {}
-    mirror_of_patch = np.full(max(len(scene.patch_shapes), 1), -1)
-    for part in seen.parts.values():
-        mirror_of_patch[list(scene.parts[part].patches)] = part
-    for number, part in seen.parts.items():
-        own = seen.pixels[number]
-        some, on_grid = _some(own.pixel.numpy(), chosen)
-        if not len(some):
-            continue
-        layer = ReflectionLayer.empty(own.select(some, number, width), Technique.RAYTRACED, scene.device)
-        bvh.trace_pixels(scene, gbuffer, layer.pixels, layer, part, False, threads=threads, kernels=kernels)
-        shown = layer.triangle.numpy()
-        met, times = np.unique(mirror_of_patch[scene.host_triangle_patch[shown[shown >= 0]]], return_counts=True)
-        mirrored[part] = {int(k): float(n) / len(shown) for k, n in zip(met, times, strict=True) if k >= 0}
-        found.append(_taken(points_of(scene, gbuffer, layer, threads), np.flatnonzero((shown >= 0) & on_grid)))
-        count += own.count * float((shown >= 0).mean())
+    mirrors = {part: seen.pixels[id] for id, part in seen.parts.items() if seen.pixels[id].count}
+    ids = gbuffer.reflector_id.numpy()[chosen]
+    id_of = {part: id for id, part in seen.parts.items()}
+    tried = {part: _some(own.pixel.numpy(), chosen[ids == id_of[part]]) for part, own in mirrors.items()}
+    if tried:
+        shown = _shown(scene, gbuffer, mirrors, {part: place for part, (place, _) in tried.items()}, threads)
+        triangle = shown.triangle.numpy()
+        mirror_of_patch = np.full(len(scene.patch_shapes), -1)
+        for part in seen.parts.values():
+            mirror_of_patch[list(scene.parts[part].patches)] = part
+        met = np.where(triangle >= 0, mirror_of_patch[scene.host_triangle_patch.take(triangle, mode="clip")], -1)
+        end = 0
+        for part, (place, _) in tried.items():
+            begin, end = end, end + len(place)
+            times = np.bincount(met[begin:end] + 1)[1:]
+            mirrored[part] = {int(k): float(times[k]) / len(place) for k in np.flatnonzero(times)}
+            count += mirrors[part].count * float((triangle[begin:end] >= 0).mean())
+        on_grid = np.concatenate([on_grid for _, on_grid in tried.values()])
+        kept = np.flatnonzero((triangle >= 0) & on_grid)
+        found.append(_taken(points_of(scene, gbuffer, shown, threads), kept))
     return Probe(_joined(found, (width, height), scene.device), round(count), mirrored)
 
 
+def _shown(
+    scene: Scene,
+    gbuffer: GBuffer,
+    mirrors: Mapping[int, MirrorPixels],
+    places: Mapping[int, np.ndarray],
+    threads: int,
+) -> ReflectionLayer:
+    """What mirrors show at some of their pixels, mirror after mirror, all traced together.
+
+    Neighbours that are far apart share nothing: plain kernels trace them as fast as vectors do.
+
+    Args:
+        scene, gbuffer: What is seen.
+        mirrors: Their pixels, by part.
+        places: Which of those, by part.
+        threads: CPU threads; 0: one per core.
+    """
+    device = scene.device
+
+    def taken(name: str, kind) -> wp.array:
+        rows = [getattr(own, name).numpy()[places[part]] for part, own in mirrors.items()]
+        return _array(np.concatenate(rows), kind, device)
+
+    vectors = [taken(name, wp.vec3) for name in ("point", "normal", "direction")]
+    pixel = taken("pixel", int)
+    pixels = MirrorPixels(NO_REFLECTOR, pixel, *vectors, (0, 0, *gbuffer.camera.size))
+    layer = ReflectionLayer.empty(pixels, Technique.RAYTRACED, device)
+    part_of = np.repeat(list(mirrors), [len(places[part]) for part in mirrors])
+    tracers: dict[int, list[int]] = {}
+    for part in mirrors:
+        tracers.setdefault(id(scene.mirror_tracer(part)), []).append(part)
+    how = {"threads": threads, "kernels": "plain"}
+    for parts in tracers.values():
+        index = None
+        if len(tracers) > 1:
+            index = _array(np.flatnonzero(np.isin(part_of, parts)).astype(np.int32), int, device)
+        bvh.trace_pixels(scene, gbuffer, pixels, layer, parts[0], False, index, meets_own=True, **how)
+    own = [scene.parts[part] for part in mirrors]
+    first, count = (
+        np.repeat(numbers, [len(places[part]) for part in mirrors])
+        for numbers in ([each.first_triangle for each in own], [each.triangle_count for each in own])
+    )
+    triangle = layer.triangle.numpy()
+    meets_own = (triangle >= first) & (triangle < first + count)
+    for part in np.unique(part_of[meets_own]):
+        # Of its own body, what a ray leaves from behind is stepped over.
+        again = np.flatnonzero(meets_own & (part_of == part)).astype(np.int32)
+        bvh.trace_pixels(scene, gbuffer, pixels, layer, int(part), False, _array(again, int, device), **how)
+    return layer
+
+
 def _some(pixel: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(places of those of a mirror's pixels that are tried, which of them are pixels of the grid), both ascending."""
+    """(places of those of a mirror's pixels that are tried, which of them are pixels of the grid), both ascending.
+
+    Args:
+        pixel: The mirror's, ascending.
+        grid: Those of them that are pixels of the grid, ascending.
+    """
     place = np.searchsorted(pixel, grid)
-    inside = place < len(pixel)
-    place = place[inside]
-    place = place[pixel[place] == grid[inside]]
     if len(place) >= min(LEAST_TRIED, len(pixel)):
         return place, np.ones(len(place), bool)
-    more = np.union1d(place, np.arange(0, len(pixel), max(len(pixel) // LEAST_TRIED, 1)))
-    return more, np.isin(more, place)
+    more = np.arange(0, len(pixel), max(len(pixel) // LEAST_TRIED, 1))
+    tried, first = np.unique(np.concatenate([place, more]), return_index=True)
+    return tried, first < len(place)
 
 
 def _taken(points: Points, rows: np.ndarray | slice) -> tuple[np.ndarray, ...]:
@@ -142,12 +200,12 @@ def _taken(points: Points, rows: np.ndarray | slice) -> tuple[np.ndarray, ...]:
 
 
 def _joined(found: list[tuple[np.ndarray, ...]], size: tuple[int, int], device) -> Points:
-    triangle, u, v, direction = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
-    return Points(
-        wp.array(triangle, dtype=int, device=device),
-        wp.array(u, dtype=float, device=device),
-        wp.array(v, dtype=float, device=device),
-        wp.array(direction, dtype=wp.vec3, device=device),
-        wp.zeros(0, dtype=int, device=device),
-        *size,
-    )
+    arrays = (np.concatenate(each) for each in zip(*found, strict=True))
+    kinds = int, float, float, wp.vec3
+    made = [_array(array, kind, device) for array, kind in zip(arrays, kinds, strict=True)]
+    return Points(*made, wp.zeros(0, dtype=int, device=device), *size)
+
+
+def _array(values: np.ndarray, kind, device) -> wp.array:
+    """Of values that nobody writes to."""
+    return wp.array(values, dtype=kind, device=device, copy=False)

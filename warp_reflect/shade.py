@@ -253,7 +253,7 @@ def dome_irradiance_kernel(
 
 def dome_irradiances(scene: Scene, normal: np.ndarray, threads: int = 0) -> np.ndarray:
     """Irradiance of a scene's domes on surfaces of unit normals [n, 3], float32 [n, 3]."""
-    normals = wp.array(np.ascontiguousarray(normal, np.float32), dtype=wp.vec3, device=scene.device)
+    normals = wp.array(np.ascontiguousarray(normal, np.float32), dtype=wp.vec3, device=scene.device, copy=False)
     result = wp.zeros(len(normals), dtype=wp.vec3, device=scene.device)
     launch.launch(dome_irradiance_kernel, len(normals), [scene.lights, normals, result], scene.device, threads)
     return result.numpy()
