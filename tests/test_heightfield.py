@@ -113,11 +113,36 @@ def test_heightfield_answers_as_every_column_asked(device):
         origins, directions = hard_rays(rng, CORPUS, (nx, ny, 8.0))
         traces = [trace_heightfield(field, origins, directions, walk) for walk in WALKS]
         assert_same(*traces)
+        for walk, vector in zip(WALKS, traces, strict=True):
+            plain = trace_heightfield(field, origins, directions, walk, kernels="plain")
+            assert_same(plain, vector)
+            np.testing.assert_array_equal(plain.steps.numpy(), vector.steps.numpy())
         low, high = oracles.column_boxes(heights)
         assert check_against_boxes(traces[0], low, high, origins, directions) > 0.5 * CORPUS
         cell = np.maximum(traces[0].cell.numpy(), 0)
         check_faces(traces[0], origins, directions, heights[cell[:, 1], cell[:, 0]])
         assert len(np.unique(traces[0].kind.numpy())) == 3
+
+
+@pytest.mark.parametrize("up", ["Y", "Z"])
+@pytest.mark.parametrize("walk", list(WALKS))
+def test_rays_side_by_side_walk_as_single_ones(walk, up):
+    """Far and short ways mixed, rays that are none among them, ends of tasks, limits: to the last bit and step."""
+    rng = np.random.default_rng(11)
+    heights = rng.uniform(0.0, 9.0, (200, 150)) * (rng.random((200, 150)) < 0.15)
+    heights[rng.random(heights.shape) < 0.01] = np.nan
+    field = make_heightfield(heights, 0.5, (3.0, -2.0, 1.0), up, (0.25, 0.5, 0.75))
+    for count in (1, 63, 255, 257, 3000):
+        origins, directions = hard_rays(rng, count, (75.0, 75.0, 6.0))
+        directions[rng.random(count) < 0.3, 2] *= 0.02
+        origins[rng.random(count) < 0.02] = np.nan
+        directions[rng.random(count) < 0.02] = 0.0
+        rays = [wp.array(each.astype(np.float32), dtype=wp.vec3) for each in (origins, directions)]
+        for limit in (0, 1, 7):
+            plain, vector = (trace_heightfield(field, *rays, walk, 1, limit, each) for each in ("plain", "auto"))
+            assert_same(plain, vector)
+            np.testing.assert_array_equal(plain.steps.numpy(), vector.steps.numpy())
+    assert len(np.unique(plain.status.numpy())) >= 5
 
 
 def test_grid_of_cells_answers_as_every_cell_asked(device):

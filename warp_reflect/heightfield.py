@@ -22,6 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from warp_reflect import vector
 from warp_reflect.grid_rays import (
     CELLS_MAX,
     FAR,
@@ -324,6 +325,25 @@ def trace_field(
     return hit
 
 
+@wp.func
+def put_hit(
+    i: int,
+    hit: GridHit,
+    out_kind: wp.array(dtype=int),
+    out_t: wp.array(dtype=float),
+    out_cell: wp.array(dtype=wp.vec3i),
+    out_normal: wp.array(dtype=wp.vec3),
+    out_steps: wp.array(dtype=int),
+    out_status: wp.array(dtype=wp.uint8),
+):
+    out_kind[i] = hit.kind
+    out_t[i] = hit.t
+    out_cell[i] = hit.cell
+    out_normal[i] = hit.normal
+    out_steps[i] = hit.steps
+    out_status[i] = wp.uint8(hit.status)
+
+
 @wp.kernel
 def trace_heightfield_kernel(
     first: int,
@@ -342,12 +362,7 @@ def trace_heightfield_kernel(
     """One thread per ray."""
     i = first + wp.tid()
     hit = trace_field(field, origins[i], directions[i], hierarchy, step_limit)
-    out_kind[i] = hit.kind
-    out_t[i] = hit.t
-    out_cell[i] = hit.cell
-    out_normal[i] = hit.normal
-    out_steps[i] = hit.steps
-    out_status[i] = wp.uint8(hit.status)
+    put_hit(i, hit, out_kind, out_t, out_cell, out_normal, out_steps, out_status)
 
 
 @dataclass(frozen=True)
@@ -430,7 +445,13 @@ def greatest_of_four(level: np.ndarray) -> np.ndarray:
 
 
 def trace_heightfield(
-    field: Heightfield, origins, directions, walk: str = "hierarchy", threads: int = 0, step_limit: int = 0
+    field: Heightfield,
+    origins,
+    directions,
+    walk: str = "hierarchy",
+    threads: int = 0,
+    step_limit: int = 0,
+    kernels: str = "auto",
 ) -> GridTrace:
     """The first thing that each ray meets in a heightfield.
 
@@ -442,6 +463,7 @@ def trace_heightfield(
         walk: "hierarchy" or "cells": the same answers.
         threads: CPU threads; 0: one per core.
         step_limit: A ray ends with status STEP_LIMIT after so many steps; 0: a bound that none reaches.
+        kernels: `Settings.kernels`: the same answers.
 
     Raises:
         ValueError: an unknown walk, or arrays of other or unequal shapes.
@@ -454,6 +476,12 @@ def trace_heightfield(
         raise ValueError(f"directions: got {len(directions)}, expected {len(origins)}, one per origin")
     trace = GridTrace.empty(len(origins), field.device)
     limit = step_limit or field.step_limit(walk)
+    if vector.chosen(kernels, field.device):
+        from warp_reflect import heightfield_vector  # which uses this module's functions
+
+        rays = [origins, directions]
+        heightfield_vector.trace(field.view, rays, WALKS[walk], limit, trace, field.device, threads)
+        return trace
     inputs = [field.view, origins, directions, WALKS[walk], limit, *trace.arrays]
     launch(trace_heightfield_kernel, len(origins), inputs, field.device, threads, split_min=TRACE_SPLIT_MIN)
     return trace
