@@ -50,10 +50,10 @@ def test_a_small_table_is_made_and_a_failing_bench_is_named_beside_it(figures, c
     assert "**broken failed**: tools/bench_frames.py ended with 1" in out and "no_such.usda" in out.split("failed**")[1]
     assert "warp-lang 1." in out.splitlines()[0] and "cores" in out.splitlines()[0]
     rows = [line for line in out.splitlines() if line.startswith("|")]
-    assert rows[:2] == ["| kernel | sm_90 |", "|---|---:|"] and len(rows) == 3
-    kernel, used = rows[2].strip("| ").split(" | ")
-    registers, stack = map(int, used.split("/"))
-    assert kernel == "probe_kernel" and 0 < registers < 256 and stack == 0
+    assert rows[:2] == ["| kernel | arrays | sm_90 |", "|---|---:|---:|"] and len(rows) == 3
+    kernel, arrays, used = rows[2].strip("| ").split(" | ")
+    registers, stack, share = used.split("/")
+    assert kernel == "probe_kernel" and 0 < int(registers) < 256 and (arrays, stack, share) == ("0", "0", "100%")
     assert figures.main(["--small", "--only", "slow", "--limit", "0.1"]) == 1
     assert "took longer than 0.1 s" in capsys.readouterr().out
 

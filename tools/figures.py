@@ -123,12 +123,13 @@ FIGURES = {
         },
     ),
     "registers": Figure(
-        "CUDA kernels: registers / bytes of stack a thread",
+        "CUDA kernels: registers / bytes of stack a thread / occupancy",
         "cubin_registers.py",
         (),
         ("warp_reflect.vector", "--arch", "90"),
         {
             "kernel": word("kernel"),
+            "arrays": number("arrays", 0),
             **{f"sm_{arch}": word(f"sm_{arch}") for arch in (75, 80, 86, 89, 90, 100, 120)},
         },
     ),

@@ -84,7 +84,8 @@ def estimate_kernel(
     right = float(-1.0e30)
     top = float(1.0e30)
     bottom = float(-1.0e30)
-    for k in range(8):
+    # Of a length that the compiler does not know: unrolled, the corners take 228 registers of a GPU, all loaded at once.
+    for k in range(corner.shape[1]):
         slot = corner[i, k]
         status = int(node.status[slot])
         if status == HIDDEN:
