@@ -11,15 +11,18 @@ from rooms import placed, render, room, sphere
 import warp_reflect as wr
 from warp_reflect import choice, direct, launch
 from warp_reflect.budget import (
+    BOUNCE_LAYERS,
     BUILT_IN,
     GLOSSY_RAYS,
     TRACE_BASE,
     Costs,
     Work,
+    bounce_ms,
     fixed_ms,
     lobe_ms,
     loss,
     predict,
+    scattered_ms,
     shadow_ray_ms,
     speedup,
     through_ms,
@@ -110,6 +113,10 @@ def test_lobes_cost_their_rays_and_these_their_shadows():
     assert lobe_ms(1000, 0, TRACE_BASE, 0.5, Settings(glossy="filter"), ONES) == pytest.approx(1.0)
     assert through_ms(1000, 0.5, ONES) == pytest.approx(1.0 + 500.0)
     assert shadow_ray_ms(TRACE_BASE, ONES) == pytest.approx(1e-3) and shadow_ray_ms(256, ONES) == pytest.approx(5e-4)
+    scattered = 1000 * (0.25 + 0.47 * 0.001**0.5) * (1 + 20) + 1000
+    assert scattered_ms(1000, 20.0, 1, ONES) == pytest.approx(1e-3 * scattered)
+    assert bounce_ms(1000, 20.0, 1, ONES) == pytest.approx(1e-3 * (scattered + BOUNCE_LAYERS))
+    assert scattered_ms(0, 20.0, 1, ONES) == 0.0
     assert GLOSSY_RAYS.keys() >= set(GLOSSY) - {"auto"}
     assert GLOSSY_RAYS["gather"] == glossy_gather.SAMPLES and GLOSSY_RAYS["accumulate"] == glossy_rays.SAMPLES
 
@@ -407,6 +414,16 @@ def test_rays_of_rough_mirrors_are_those_predicted(settings, rays, device):
     assert asked == rays * row.pixels
     sharp = planned(scene, glossy="off")
     assert plan.fixed_ms > sharp.fixed_ms and plan.predicted["first_ms"] > sharp.predicted["first_ms"]
+
+
+def test_what_mirrors_show_of_mirrors_is_followed_by_about_the_rays_predicted(device):
+    scene = wr.load_stage(Path(__file__).parent.parent / "usd_scenes" / "facing_mirrors.usda", device=str(device))
+    plan = wr.make_plan(scene, size=(320, 180), settings=Settings(threads=1))
+    rays = sum(row.pixels * row.effects["second_bounce"].numbers.get("share", 0.0) for row in plan.rows)
+    bounced = wr.render_frame(scene, plan).statistics["bounced"]
+    assert bounced > 1000 and bounced / 1.3 <= rays <= 1.3 * bounced
+    single = wr.make_plan(scene, size=(320, 180), settings=Settings(threads=1, bounces=1))
+    assert plan.fixed_ms > single.fixed_ms
 
 
 @pytest.mark.parametrize("glass", [MaterialData(opacity=0.3), MaterialData(transmission=1.0, roughness=0.0)])

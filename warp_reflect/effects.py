@@ -110,6 +110,11 @@ def pane_rays(pixels: int, interface: str, effects: dict[str, Effect], settings:
     return pixels * again * (1 + onward)
 
 
+def frost_rays(pixels: int, effects: dict[str, Effect], settings: Settings) -> int:
+    """Rays that correct what a frosted surface blurs."""
+    return pixels * settings.frost_rays if effects["frost"].on and not settings.frost_samples else 0
+
+
 def bounce_effect(visible: bool, alone: bool, mirrored: float | None, settings: Settings) -> Effect:
     """Whether what a mirror shows of mirrors is followed on.
 

@@ -137,6 +137,7 @@ def _effect(settings: Settings, kind: str, tried: _Tried | None, pixels: int, ra
     if tried is None:
         return Effect(False, "nothing is seen that it could light")
     rays = pixels * tried.lit
+    alone = tried.lit * (1 if kind == "distant" else first_count(settings.shadow_samples) + settings.shadow_samples)
     error = penumbra = 0.0
     if kind == "area":
         samples = settings.shadow_samples
@@ -157,6 +158,7 @@ def _effect(settings: Settings, kind: str, tried: _Tried | None, pixels: int, ra
         "lit": tried.lit,
         "points": pixels,
         "rays": round(rays),
+        "rays_alone": alone,  # from a point that shares nothing with neighbours
         "ms": ms,
         "penumbra_error": error,
     }

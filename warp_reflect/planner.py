@@ -21,11 +21,23 @@ from warp_reflect import (
     vector,
 )
 from warp_reflect.applicable import PREFERRED
-from warp_reflect.budget import BUILT_IN, Costs, fixed_ms, lobe_ms, loss, predict, through_ms
+from warp_reflect.budget import (
+    BUILT_IN,
+    Costs,
+    bounce_ms,
+    fixed_ms,
+    lobe_ms,
+    loss,
+    predict,
+    scattered_ms,
+    through_ms,
+)
+from warp_reflect.direct import AREA_KINDS
 from warp_reflect.effects import (
     Effect,
     bounce_effect,
     finish_effects,
+    frost_rays,
     lobe_rays,
     pane_effects,
     pane_rays,
@@ -135,7 +147,7 @@ class Plan:
 
     @property
     def fixed_ms(self) -> float:
-        """Predicted milliseconds of a frame whatever is chosen: the eye's view, the shading, finishes, panes."""
+        """Predicted milliseconds of a frame whatever is chosen: the eye's view, the shading, finishes, panes, bounces."""
         width, height = self.size
         seen = sum(row.pixels for row in self.rows)
         triangles, threads = self.scene.triangle_count, thread_count(self.scene.device, self.settings.threads)
@@ -149,7 +161,19 @@ class Plan:
         )
         followed = [pane_rays(pane.pixels, pane.interface, pane.effects, pane.settings) for pane in self.panes]
         panes = sum(through_ms(rays, point, self.costs, threads) for rays in followed)
-        return fixed_ms(triangles, width * height, seen, self.costs, threads) + shadows + finishes + panes
+        alone = sum(numbers.get("rays_alone", 0.0) for numbers in cast)
+        frost = sum(
+            scattered_ms(frost_rays(pane.pixels, pane.effects, pane.settings), alone, triangles, self.costs, threads)
+            for pane in self.panes
+        )
+        shares = [(row.pixels, row.effects["second_bounce"]) for row in self.rows]
+        bounces = sum(
+            bounce_ms(round(pixels * bounce.numbers["share"]), alone, triangles, self.costs, threads)
+            for pixels, bounce in shares
+            if bounce.on
+        )
+        view = fixed_ms(triangles, width * height, seen, self.costs, threads)
+        return view + shadows + finishes + panes + frost + bounces
 
     @property
     def shadows(self) -> Shadows | None:
@@ -630,13 +654,15 @@ def _tried(
 ) -> tuple[Probe | None, list[LightRow]]:
     """(What is tried of what the camera sees, where lights or bounces are decided by that; the lights).
 
-    A quarter of the points is enough where every light clearly casts shadows and every mirror shows a mirror.
+    A quarter of the points is enough where every light clearly casts shadows and every mirror shows a mirror; not of shapes,
+    the cost of whose shadows hangs on how far their penumbras reach.
     """
     clear = [k for k in mirrors if pixels[k] >= max(settings.few_pixels, 1)]
     facing = settings.bounces > 1 and (len(mirrors) > 1 or any(not scene.body(k).convex for k in clear))
     if seen is None or not (needs_probe(scene, settings) or facing):
         return None, plan_lights(scene, None, settings, costs)
-    for spacing in (2, 1):
+    shapes = needs_probe(scene, settings) and any(light.kind in AREA_KINDS for light in scene.data.lights)
+    for spacing in (1,) if shapes else (2, 1):
         tried = probe(scene, seen, settings.threads, spacing)
         lights = plan_lights(scene, tried, settings, costs)
         if are_clear(lights, settings) and (not facing or all(tried.mirrored.values())):
