@@ -30,6 +30,7 @@ def test_every_figure_has_its_tool(figures):
         (["--only"], "expected at least one argument"),
         (["--limit", "0"], "got 0, expected more than 0"),
         (["--limit", "nan"], "got nan, expected more than 0"),
+        (["--total", "-1"], "--total: got -1, expected more than 0"),
         (["frames"], "unrecognized arguments: frames"),
     ],
 )
@@ -56,6 +57,9 @@ def test_a_small_table_is_made_and_a_failing_bench_is_named_beside_it(figures, c
     assert kernel == "probe_kernel" and 0 < int(registers) < 256 and (arrays, stack, share) == ("0", "0", "100%")
     assert figures.main(["--small", "--only", "slow", "--limit", "0.1"]) == 1
     assert "took longer than 0.1 s" in capsys.readouterr().out
+    assert figures.main(["--quick", "--only", "slow", "registers", "--total", "0.1"]) == 1
+    out, err = capsys.readouterr()
+    assert "slow failed" in out and "no time was left of 0.1 s" in out and err == "failed: slow, registers\n"
 
 
 def test_tables_leave_empty_columns_out_and_compare_within_a_picture(figures):

@@ -5,7 +5,8 @@
     python tools/figures.py --small
 
 What a benchmark measures, and how, stands at its own head. One that fails is named where its table would stand, the others go
-on, and the exit code is 1. `--small` takes the smallest pictures and one round: it tries the command, its times say nothing.
+on, and the exit code is 1. The whole ends after `--total` seconds: what is then left is named like what failed. `--small` (or
+`--quick`) takes the smallest pictures and one round: it tries the command, its times say nothing.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ ROOT = Path(__file__).resolve().parents[1]
 SCENES = "usd_scenes/one_mirror.usda", "usd_scenes/kitchen.usda"
 SIZES = "640x480", "1280x720", "1920x1080"  # of the aims that the frames are held to
 ROUNDS = "7"
-LIMIT = 1800.0  # seconds
+LIMIT, TOTAL = 600.0, 1500.0  # seconds: of one benchmark and of all
 FAILED_LINES = 5  # of what a failing benchmark said last
 
 
@@ -122,6 +123,67 @@ FIGURES = {
             "million elements/s": rate,
         },
     ),
+    "roofline": Figure(
+        "Each kernel of a frame beside the machine's peaks: one thread",
+        "bench_roofline.py",
+        (*SCENES, "--size", SIZES[1], "--rounds", ROUNDS),
+        ("usd_scenes/sphere_on_checker.usda", "--size", "96x54", "--rounds", "1", "--steps", "1000"),
+        {
+            "scene": word("stage"),
+            "kernel": word("kernel"),
+            "ms": number("ms", 2),
+            "flops an element": number("flops", 0),
+            "bytes": number("bytes", 0),
+            "instructions": number("instructions", 0),
+            "Gflop/s": number("gflops"),
+            "of peak": number("of_flops", 0, 100.0, " %"),
+            "GB/s": number("gbytes"),
+            "of first cache": number("of_near", 0, 100.0, " %"),
+            "arrays, of memory": number("of_far", 0, 100.0, " %"),
+            "instructions a cycle": number("ipc", 2),
+            "bound": word("bound"),
+        },
+    ),
+    "slopes": Figure(
+        "How reflections' time grows: exponents of fitted powers",
+        "bench_frames.py",
+        (SCENES[1], "--size", SIZES[0], "--frames", "3", "--slopes", "--method", "reflector_map"),
+        ("usd_scenes/sphere_on_checker.usda", "--size", "96x54", "--frames", "1", "--slopes"),
+        {
+            "scene": word("stage"),
+            "contender": word("contender", "technique"),
+            "grows with": word("quantity"),
+            "exponent": number("slope", 2),
+            "at": lambda row, _: ", ".join(f"{amount:,.0f}" for amount in row["amounts"]),
+            "reflection ms": lambda row, _: ", ".join(f"{ms:.1f}" for ms in row["reflect_ms"]),
+        },
+    ),
+    "peers": Figure(
+        "Other renderers",
+        "peers.py",
+        (*SCENES, "--size", SIZES[1], "--threads", "2", "--rounds", "5"),
+        ("usd_scenes/sphere_on_checker.usda", "--size", "96x54", "--rounds", "1"),
+        {
+            "scene": word("stage"),
+            "size": size,
+            "contender": word("contender"),
+            "shadows": word("shadows"),
+            "reflection ms": number("reflect_ms"),
+            "frame ms": number("frame_ms"),
+            "identical": number("identical", 3, 100.0, " %"),
+            "PSNR dB": number("psnr_db"),
+            "against": word("against"),
+        },
+    ),
+    "shadows": Figure(
+        "Shadow rays beside Embree's",
+        "bench_shadows.py",
+        ("usd_scenes/kitchen.usda", "--size", "640x360", "--threads", "1"),
+        ("usd_scenes/sphere_on_checker.usda", "--size", "96x54", "--rounds", "1"),
+    ),
+    "heightfield": Figure(
+        "Rays through a heightfield", "bench_heightfield.py", (), ("--cells", "64", "--rays", "2000")
+    ),
     "registers": Figure(
         "CUDA kernels: registers / bytes of stack a thread / occupancy",
         "cubin_registers.py",
@@ -179,24 +241,29 @@ class Failed(Exception):
 def main(words: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", metavar="NAME", help=f"some of {', '.join(FIGURES)}")
-    parser.add_argument("--small", action="store_true", help="smallest pictures, one round")
+    parser.add_argument("--small", "--quick", action="store_true", help="smallest pictures, one round")
     parser.add_argument("--limit", type=float, default=LIMIT, metavar="SECONDS", help="of one benchmark")
+    parser.add_argument("--total", type=float, default=TOTAL, metavar="SECONDS", help="of all")
     arguments = parser.parse_args(words)
     names = arguments.only or list(FIGURES)
     unknown = [name for name in names if name not in FIGURES]
     if unknown:
         parser.error(f"argument --only: got {', '.join(unknown)}, expected some of {', '.join(FIGURES)}")
-    if not arguments.limit > 0.0:
-        parser.error(f"argument --limit: got {arguments.limit:g}, expected more than 0 seconds")
+    for name in ("limit", "total"):
+        if not getattr(arguments, name) > 0.0:
+            parser.error(f"argument --{name}: got {getattr(arguments, name):g}, expected more than 0 seconds")
     print(f"{told(machine())}\n", flush=True)
     failed = []
+    end = time.monotonic() + arguments.total
     for name in dict.fromkeys(names):
         figure = FIGURES[name]
         asked = figure.small if arguments.small else figure.asked
         print(f"### {figure.title}\n\n`{' '.join(('tools/' + figure.tool, *asked))}`\n", flush=True)
         start = time.monotonic()
         try:
-            text = made(figure, asked, arguments.limit)
+            if start >= end:
+                raise Failed(f"no time was left of {arguments.total:g} s (--total)")
+            text = made(figure, asked, min(arguments.limit, end - start))
         except Failed as error:
             failed.append(name)
             text = f"**{name} failed**: {error}"
@@ -219,7 +286,7 @@ def made(figure: Figure, asked: Iterable[str], limit: float) -> str:
     try:
         done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=limit, check=False)
     except subprocess.TimeoutExpired:
-        raise Failed(f"tools/{figure.tool} took longer than {limit:g} s (--limit)") from None
+        raise Failed(f"tools/{figure.tool} took longer than {limit:.4g} s (--limit, --total)") from None
     if done.returncode:
         said = [line for line in done.stderr.splitlines() if line.strip()][-FAILED_LINES:]
         raise Failed(f"tools/{figure.tool} ended with {done.returncode}\n\n```\n" + "\n".join(said) + "\n```")

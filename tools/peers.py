@@ -11,11 +11,12 @@ two is what edges cost that are not smoothed.
 
 Without it, times: medians over rounds in which all contenders take turns, each with its error on the same row.
 `identical` is the share of mirror rays that meet the reference's triangle; `PSNR` is of the sRGB picture, against the
-converged picture of Mitsuba by the same rays and the same light without shadows, or, for Mitsuba's own path tracer
-(which adds shadows and one more bounce), against its own converged picture: its noise.
+converged picture of Mitsuba by the same rays and the same light, or, for Mitsuba's own path tracer (which always casts
+all shadows and adds one more bounce), against its own converged picture: its noise. `--light-shadows` says which lights'
+shadows the package and `mitsuba direct` both cast, none of them by default.
 
-Mitsuba's vectorised variant needs LLVM 16 or later (DRJIT_LIBLLVM_PATH names the library), VTK a GL that draws off
-screen; who is missing is said and left out.
+Mitsuba's vectorised variant needs LLVM 16 or later: DRJIT_LIBLLVM_PATH names the library, or one is looked for where
+distributions and Rust keep theirs; VTK needs a GL that draws off screen. What is used is said, who is missing is left out.
 """
 
 from __future__ import annotations
@@ -24,8 +25,11 @@ import argparse
 import contextlib
 import ctypes
 import dataclasses
+import glob
 import importlib.util
 import json
+import mmap
+import os
 import statistics
 import sys
 import time
@@ -43,6 +47,10 @@ ENVIRONMENT_SIDE = 512  # pixels of a face of VTK's environment
 CONVERGED = 128  # samples a pixel of the pictures that others are measured against
 SCALAR_CONVERGED = 32  # where there is no vectorised variant
 LLVM = "llvm_ad_rgb"
+# Where shared libraries of LLVM lie, and what those since version 16 have.
+LLVM_PLACES = "/usr/lib/*/libLLVM*.so*", "/usr/lib/llvm-*/lib/libLLVM*.so*", "~/.rustup/toolchains/*/lib/libLLVM*.so*"
+LLVM_LIBRARY, LLVM_SYMBOL = "DRJIT_LIBLLVM_PATH", b"LLVMGetVersion\0"
+WARM_UP = 2  # rounds: Dr.Jit compiles another kernel for its second frame
 PATH_DEPTH = 3  # eye, mirror, surface, light
 
 
@@ -53,9 +61,12 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--size", default="480x270", help="WxH")
     parser.add_argument("--samples", type=int, default=64, help="light samples a pixel of the judging picture")
     parser.add_argument("--shadows", default="none,lights,all", help=f"some of {','.join(LIGHTING)}, for --compare")
-    parser.add_argument("--rounds", type=int, default=5, help="timed rounds, after one for warm-up")
+    parser.add_argument("--rounds", type=int, default=5, help="timed rounds, after two for warm-up")
     parser.add_argument("--peer-samples", type=int, default=4, help="samples a pixel of Mitsuba's timed pictures")
     parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument(
+        "--light-shadows", default="none", choices=LIGHTING, help="which lights' shadows both cast in timed pictures"
+    )
     parser.add_argument("--out", help="folder for the pictures that were compared or timed")
     parser.add_argument("--json", action="store_true", help="one line of JSON a row")
     return parser.parse_args()
@@ -65,7 +76,9 @@ def main() -> None:
     arguments = parse()
     wp.config.quiet = True
     size = tuple(int(side) for side in arguments.size.split("x"))
+    library = name_llvm()
     fault = llvm_fault(arguments.threads)
+    print(f"LLVM: {library or 'none of 16 or later was found; what Dr.Jit finds itself'}", file=sys.stderr)
     if fault:
         print(f"Mitsuba {LLVM}: {fault}", file=sys.stderr)
         if arguments.compare:
@@ -78,6 +91,21 @@ def main() -> None:
             print(json.dumps(row))
     else:
         (judge_table if arguments.compare else time_table)(rows, arguments)
+
+
+def name_llvm() -> str:
+    """The library that is named in the environment, or the first found that is new enough, which then is; else ""."""
+    if LLVM_LIBRARY not in os.environ:
+        for place in LLVM_PLACES:
+            for path in sorted(glob.glob(os.path.expanduser(place)), reverse=True):
+                with open(path, "rb") as file:
+                    if (
+                        os.path.getsize(path)
+                        and mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ).find(LLVM_SYMBOL) >= 0
+                    ):
+                        os.environ[LLVM_LIBRARY] = path
+                        return path
+    return os.environ.get(LLVM_LIBRARY, "")
 
 
 def llvm_fault(threads: int) -> str:
@@ -190,6 +218,7 @@ class Contender:
     identical: object = None  # () -> share of mirror rays with the reference's triangle
     quality: object = None  # () -> (PSNR, against what)
     picture: object = None  # () -> linear picture
+    shadows: str | None = None  # whose; None: those that are asked for
 
 
 def times(stage: str, size: tuple[int, int], arguments, llvm: bool) -> list[dict]:
@@ -199,7 +228,12 @@ def times(stage: str, size: tuple[int, int], arguments, llvm: bool) -> list[dict
 
     mitsuba = importlib.util.find_spec("mitsuba") is not None
     scene, mirrors = diffuse_stage(stage, size) if mitsuba else (wr.load_stage(stage), set())
-    base = wr.Settings(threads=arguments.threads, keep_static=False, shadows="off")
+    base = wr.Settings(
+        threads=arguments.threads,
+        keep_static=False,
+        shadows=arguments.light_shadows != "none",
+        dome_shadows=arguments.light_shadows == "all",
+    )
     first = wr.render_frame(scene, wr.make_plan(scene, size=size, settings=base, method="reference"))
     contenders = package_contenders(scene, size, base, first)
     judged = None
@@ -214,28 +248,32 @@ def times(stage: str, size: tuple[int, int], arguments, llvm: bool) -> list[dict
                     "embreex, the mirror rays given",
                     lambda: (embree.trace(), None),
                     lambda: embree.agreement(first),
+                    shadows="",
                 )
             )
             wave = Wavefront(scene, first)
             contenders.append(
-                Contender("embree wavefront", "embreex, eye rays, NumPy, mirror rays", wave.trace, wave.agreement)
+                Contender(
+                    "embree wavefront", "embreex, eye rays, NumPy, mirror rays", wave.trace, wave.agreement, shadows=""
+                )
             )
         vtk = EnvironmentMap.over(scene, first) if mitsuba else None  # whose converter reads the scene
         if vtk:
             what = "one environment texture in PBR mirrors"
-            contenders.append(Contender("vtk", what, vtk.run, quality=vtk.quality, picture=vtk.picture))
+            contenders.append(Contender("vtk", what, vtk.run, quality=vtk.quality, picture=vtk.picture, shadows="none"))
 
     measured: dict[str, list] = {contender.name: [] for contender in contenders}
-    for round_ in range(arguments.rounds + 1):
+    for round_ in range(arguments.rounds + WARM_UP):
         for contender in contenders:
             elapsed = contender.run()
-            if round_:
+            if round_ >= WARM_UP:
                 measured[contender.name].append(elapsed)
     rows = []
     for contender in contenders:
         row = {"stage": Path(stage).stem, "size": list(size), "threads": arguments.threads, "rounds": arguments.rounds}
         row |= {"contender": contender.name, "what": contender.what, "machine": machine(), "commit": commit()}
         row["triangles"] = scene.triangle_count
+        row["shadows"] = contender.shadows if contender.shadows is not None else arguments.light_shadows
         row["mirror_pixels"] = int((first["reflectorId"] > 0).sum())
         for k, name in enumerate(("reflect_ms", "frame_ms")):
             values = [elapsed[k] for elapsed in measured[contender.name] if elapsed[k] is not None]
@@ -293,15 +331,17 @@ def mitsuba_contenders(
     counter = iter(range(1, 1 << 30))
     if llvm:
         made = mitsuba_scene.convert(data, camera, size, mirrors)
-        judged = mitsuba_scene.direct_picture(made, CONVERGED, centred=True)
+        judged = mitsuba_scene.direct_picture(made, CONVERGED, arguments.light_shadows, centred=True)
         if first.layers:
             rays = MitsubaRays(scene, first)
             what = f"{LLVM}, the mirror rays given"
-            contenders.append(Contender("mitsuba hits", what, lambda: (rays.trace(), None), rays.agreement))
+            contenders.append(Contender("mitsuba hits", what, lambda: (rays.trace(), None), rays.agreement, shadows=""))
 
         def same_light():
             start = time.perf_counter()
-            last["direct"] = mitsuba_scene.direct_picture(made, samples, centred=True, seed=next(counter))
+            last["direct"] = mitsuba_scene.direct_picture(
+                made, samples, arguments.light_shadows, centred=True, seed=next(counter)
+            )
             return None, 1000.0 * (time.perf_counter() - start)
 
         what = f"{LLVM}, same rays and light, {samples} samples"
@@ -331,6 +371,7 @@ def mitsuba_contenders(
                 path,
                 quality=lambda variant=variant: (psnr(last[variant], converged["path"]), "its own, converged"),
                 picture=lambda variant=variant: last[variant],
+                shadows="all",
             )
         )
     if llvm:
@@ -600,8 +641,8 @@ def time_table(rows: list[dict], arguments) -> None:
         f"{rows[0]['machine']}; {arguments.threads} thread(s); {arguments.size}; medians of {arguments.rounds}; "
         f"commit {rows[0]['commit']}"
     )
-    header = f"{'stage':14s} {'contender':17s} {'reflect ms':>10s} {'frame ms':>9s} {'identical':>10s} {'PSNR dB':>8s}"
-    print(header + "  against; what")
+    header = f"{'stage':14s} {'contender':17s} {'reflect ms':>10s} {'frame ms':>9s} {'identical':>10s} {'PSNR dB':>8s} "
+    print(header + f"{'shadows':8s}  against; what")
     for row in rows:
         cells = [
             f"{'-':>{width}s}" if row[name] is None else f"{scale * row[name]:{width}.{digits}f}"
@@ -615,7 +656,8 @@ def time_table(rows: list[dict], arguments) -> None:
         percent = " " if row["identical"] is None else "%"
         against = f"{row['against']}; " if row["against"] else ""
         print(
-            f"{row['stage'][:14]:14s} {row['contender']:17s} {cells[0]} {cells[1]} {cells[2]}{percent} {cells[3]}  "
+            f"{row['stage'][:14]:14s} {row['contender']:17s} {cells[0]} {cells[1]} {cells[2]}{percent} {cells[3]} "
+            f"{row['shadows']:8s}  "
             f"{against}{row['what']}"
         )
 
