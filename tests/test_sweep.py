@@ -17,7 +17,7 @@ import warp_reflect as wr
 from warp_reflect import cli, sweep, sweep_report
 from warp_reflect.realised import as_points
 from warp_reflect.scene import Scene
-from warp_reflect.settings import Settings
+from warp_reflect.settings import COMPLEXITIES, Settings
 from warp_reflect.techniques import TECHNIQUES
 
 ROOT = Path(__file__).parent.parent
@@ -106,6 +106,26 @@ def test_contenders_cover_the_cells_of_fields_where_mirrors_move(scene):
     found = cells(moving)
     assert found[0] == 0.0 and len(found) == 1 + len(sweep.FIELD_CELLS)
     assert np.allclose(sorted(scene.size / np.array(found[1:])), sweep.FIELD_CELLS, rtol=0.06)
+
+
+def test_tessellations_are_rows_judged_by_the_same_reference(scene):
+    base = Settings(threads=1)
+    every, _ = sweep.default_contenders(scene, None, SIZE, base, COMPLEXITIES)
+    chosen = sweep.choose(every, ["complexity"])
+    assert [each.settings.complexity for each in chosen[1:]] == list(COMPLEXITIES[1:])
+    read = []
+
+    def load(complexity):
+        read.append(complexity)
+        return wr.load_stage(STAGE, complexity=complexity)
+
+    result = sweep.run_sweep(scene, None, SIZE, chosen, 1, read=load)
+    assert read == list(COMPLEXITIES[1:]) and not result.failed
+    for row in result.rows[1:]:
+        assert row.frame_ms > 0.0 and row.settings["complexity"] in row.name
+        assert row.error_p95_px is not None and row.wrong_share < 0.02
+    alone = sweep.run_sweep(scene, None, SIZE, chosen[:2], 1)
+    assert len(alone.rows) == 1 and "give `read`" in alone.failed[0]
 
 
 def test_choosing_refuses_a_name_that_fits_nothing(scene):

@@ -481,6 +481,7 @@ def sweep(
     device = _open_device(opened.device)
 
     from warp_reflect import sweep as sweeping
+    from warp_reflect.settings import COMPLEXITIES
     from warp_reflect.sweep_report import open_folder, write_sweep
 
     open_folder(folder)
@@ -494,10 +495,15 @@ def sweep(
         tell("reading " + stage)
         scene = _load(stage, opened, planned, settings, device, None)
         reference = _make_plan(scene, planned, settings)
-        contenders, notes = sweeping.default_contenders(scene, reference.camera, reference.size, settings)
+        asked = scene, reference.camera, reference.size
+        contenders, notes = sweeping.default_contenders(*asked, settings, COMPLEXITIES)
         if only is not None:
             contenders = sweeping.choose(contenders, [name.strip() for name in only.split(",") if name.strip()])
-        measured = sweeping.run_sweep(scene, reference.camera, reference.size, contenders, rounds, tell)
+
+        def read(complexity: str):
+            return _load(stage, opened, planned, settings.replace(complexity=complexity), device, None)
+
+        measured = sweeping.run_sweep(*asked, contenders, rounds, tell, read=read)
         measured.notes[:0] = notes
         written = write_sweep(measured, folder)
         report.notes([*scene.notes, *((stage, text) for text in [*measured.notes, *written.notes])])

@@ -199,12 +199,17 @@ class Sweep:
 
 
 def default_contenders(
-    scene: Scene, camera: str | Camera | None, size: tuple[int, int], base: Settings | None = None
+    scene: Scene,
+    camera: str | Camera | None,
+    size: tuple[int, int],
+    base: Settings | None = None,
+    complexities: Iterable[str] = (),
 ) -> tuple[list[Contender], list[str]]:
     """Every technique that applies to a mirror in view, with each of its settings; and why others are left out.
 
     Args:
         base: What all share unless their name says otherwise; None: the defaults.
+        complexities: Tessellations to read the stage at, beside that of the scene; see `run_sweep`.
 
     Returns:
         (contenders, the reference first; notes).
@@ -231,6 +236,8 @@ def default_contenders(
         add("auto")
         add("auto", warm=True)
         found += [each for each in paper_contenders(base) if each.method in usable]
+        for complexity in complexities:
+            add("auto", complexity=complexity)
     for method in usable:
         add(method)
         add(method, warm=True)
@@ -337,6 +344,7 @@ def run_sweep(
     rounds: int = 7,
     report: Callable[[str], None] | None = None,
     step: float = STEP_RADIANS,
+    read: Callable[[str], Scene] | None = None,
 ) -> Sweep:
     """Measure contenders side by side.
 
@@ -349,6 +357,8 @@ def run_sweep(
         rounds: Timed frames of each.
         report: Told what is being done, a line at a time.
         step: Of the camera from round to round: what is kept from frame to frame depends on it. [radians]
+        read: Reads the stage at another complexity than the reference's, for contenders that ask for one; None: those fail.
+            They are judged by the same reference: by how much the tessellation moves what is seen.
 
     Returns:
         A `Sweep`; without rows, and with a note, where no mirror is seen.
@@ -382,10 +392,13 @@ def run_sweep(
     )
     # Kernels are loaded, and the mirrors found, on a copy of the scene: the real one's first frames are then first.
     told(f"{len(contenders)} contenders: loading kernels")
-    spare = Scene(scene.data, str(scene.device))
+    scenes = {contenders[0].settings.complexity: scene}
+    spares = {contenders[0].settings.complexity: Scene(scene.data, str(scene.device))}
     loading, pivot = {}, None
     for contender in list(contenders):
         try:
+            _read_at(contender.settings.complexity, scenes, spares, read)
+            spare = spares[contender.settings.complexity]
             before, start = _loaded_modules(), time.perf_counter()
             frame = render_frame(spare, make_plan(spare, view, size, contender.settings, contender.method))
             if contender.warm:
@@ -403,14 +416,15 @@ def run_sweep(
                 result.notes.append("no mirror is seen from the camera: nothing to compare")
                 return result
             embree = Embree.over(spare, frame, result.notes)
-    del spare, frame
+    del spare, spares, frame
     poses = camera_path(view, pivot, rounds + 1, step)
     rows, plans, last, spent = {}, {}, {}, {each.name: [] for each in contenders}
     for contender in contenders:
         told(f"first frame: {contender.name}")
-        plan = plans[contender.name] = make_plan(scene, view, size, contender.settings, contender.method)
+        own = scenes[contender.settings.complexity]
+        plan = plans[contender.name] = make_plan(own, view, size, contender.settings, contender.method)
         start = time.perf_counter()
-        first = render_frame(scene, plan, poses[0])
+        first = render_frame(own, plan, poses[0])
         first_ms = 1000.0 * (time.perf_counter() - start)
         rows[contender.name] = _row(contender, plan, first, first_ms, loading[contender.name])
         if contender.warm:
@@ -424,7 +438,7 @@ def run_sweep(
         for contender in [contenders[0], *(contenders[k] for k in turned)]:
             name = contender.name
             started = time.process_time()
-            frame = render_frame(scene, plans[name], poses[round_], last.get(name))
+            frame = render_frame(plans[name].scene, plans[name], poses[round_], last.get(name))
             spent[name].append(frame.timings | {CPU: 1000.0 * (time.process_time() - started)})
             if contender.warm:
                 last[name] = frame
@@ -620,6 +634,18 @@ def _with_reference(contenders: list[Contender]) -> list[Contender]:
         threads = contenders[0].settings.threads if contenders else 0
         first = [Contender(REFERENCE, REFERENCE, Settings(threads=threads))]
     return first + [each for each in contenders if each.name != REFERENCE]
+
+
+def _read_at(
+    complexity: str, scenes: dict[str, Scene], spares: dict[str, Scene], read: Callable[[str], Scene] | None
+) -> None:
+    """Have a stage at a complexity, and a copy to load kernels by."""
+    if complexity in scenes:
+        return
+    if read is None:
+        raise ValueError(f"complexity={complexity}: the stage was read at {', '.join(scenes)} alone; give `read`")
+    scenes[complexity] = read(complexity)
+    spares[complexity] = Scene(scenes[complexity].data, str(scenes[complexity].device))
 
 
 def _loaded_modules() -> set[str]:
