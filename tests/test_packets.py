@@ -6,10 +6,11 @@ import warp as wp
 from test_shade import WHITE, ball_mesh, distant, dome, ground, look_at, place, scene_of, turned
 
 import warp_reflect as wr
-from warp_reflect import direct, raster, shadows, vector
+from warp_reflect import bvh_vector, direct, raster, shadows, vector
 from warp_reflect.launch import FINITE_FLAGS, launch
-from warp_reflect.packets import TRAVERSAL
 from warp_reflect.scene import LightData, MaterialData
+from warp_reflect.wide_packets import TRAVERSAL
+from warp_reflect.wide_tree import WideTree
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FINITE_FLAGS})
 CPU = wp.get_device("cpu")
@@ -108,13 +109,14 @@ def answers(points, triangles, origins, directions, reach=FAR, threads=1, leaf_s
     )
     n = len(origins)
     reach = np.broadcast_to(np.float32(reach), n)
-    inputs = [wp.uint64(mesh.id)]
+    wide = WideTree(mesh)
+    rays = []
     for values, kind in ((origins, wp.vec3), (directions, wp.vec3), (reach, float)):
-        inputs.append(wp.array(np.ascontiguousarray(values, np.float32), dtype=kind, device=CPU))
+        rays.append(wp.array(np.ascontiguousarray(values, np.float32), dtype=kind, device=CPU))
     result = []
-    for launched, kernel in ((launch, query_kernel), (vector.launch_blocks, query_blocks_kernel)):
+    for launched, kernel, tree in ((launch, query_kernel, mesh), (vector.launch_blocks, query_blocks_kernel, wide)):
         outputs = [wp.zeros(n, dtype=kind, device=CPU) for kind in (int, int, float, float, float)]
-        launched(kernel, n, inputs + outputs, CPU, threads)
+        launched(kernel, n, [wp.uint64(tree.id), *rays, *outputs], CPU, threads)
         result.append([output.numpy() for output in outputs])
     return result
 
@@ -239,6 +241,44 @@ def test_nothing_is_met_in_a_tree_of_points():
     down = np.float32([[0, -1, 0], [0, -1, 0]])
     own, packed = answers(points, triangles, origins, down)
     assert not own[0].any() and not packed[0].any() and (packed[1] == -1).all()
+
+
+def test_a_tree_that_was_fitted_to_moved_points_answers_as_warps():
+    rng = np.random.default_rng(5)
+    points, triangles = grid_of(9)
+    mesh = wp.Mesh(
+        wp.array(np.float32(points), dtype=wp.vec3, device=CPU),
+        wp.array(np.int32(triangles).reshape(-1), dtype=int, device=CPU),
+        bvh_constructor="sah",
+    )
+    wide = WideTree(mesh)
+    mesh.points.assign(np.float32(points + rng.normal(size=points.shape) * 0.3 + (5.0, 0.0, 0.0)))
+    mesh.refit()
+    wide.fit()
+    origins = rng.uniform((5, 3, 0), (14, 4, 9), (500, 3))
+    rays = [wp.array(np.float32(origins), dtype=wp.vec3, device=CPU)]
+    down = np.float32(rng.normal(size=(500, 3)) * 0.2 + (0, -1, 0))
+    rays += [wp.array(down, dtype=wp.vec3, device=CPU), wp.full(500, FAR, dtype=float, device=CPU)]
+    found = []
+    for launched, kernel, tree in ((launch, query_kernel, mesh), (vector.launch_blocks, query_blocks_kernel, wide)):
+        outputs = [wp.zeros(500, dtype=kind, device=CPU) for kind in (int, int, float, float, float)]
+        launched(kernel, 500, [wp.uint64(tree.id), *rays, *outputs], CPU, 1)
+        found.append([output.numpy() for output in outputs])
+    assert found[0][0].mean() > 0.5
+    for got, expected in zip(found[1], found[0], strict=True):
+        np.testing.assert_array_equal(got, expected)
+
+
+def test_pixels_are_taken_tile_by_tile_each_once():
+    rng = np.random.default_rng(6)
+    width, height = 37, 22
+    pixel = np.flatnonzero(rng.random(width * height) < 0.7).astype(np.int32)
+    for threads in (1, 2):
+        order = bvh_vector.in_tiles(wp.array(pixel, dtype=int, device=CPU), width, threads).numpy()
+        y, x = np.divmod(pixel, width)
+        tile = bvh_vector.TILE
+        np.testing.assert_array_equal(order, np.lexsort((x, y, x // tile, y // tile)))
+    assert bvh_vector.in_tiles(wp.array(pixel[::-1].copy(), dtype=int, device=CPU), width) is None
 
 
 LIGHTS = [

@@ -97,7 +97,8 @@ def report_rays(scene, points, arguments: argparse.Namespace) -> None:
         )
     }
     if not vector.missing():
-        ways["packets"] = lambda: shadows_vector.shares(mesh, lights, starts, count, 1, share, threads)
+        wide = wp.uint64(scene.shadow_tracer.packets)
+        ways["packets"] = lambda: shadows_vector.shares(wide, lights, starts, count, 1, share, threads)
     try:
         from embreex import rtcore_scene
         from embreex.mesh_construction import TriangleMesh

@@ -8,6 +8,7 @@ tested for here.
 from __future__ import annotations
 
 import copy
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
@@ -18,6 +19,9 @@ from warp_reflect.layers import GBuffer, MirrorPixels, ReflectionLayer
 from warp_reflect.scene import Scene, SceneView
 from warp_reflect.settings import Status
 from warp_reflect.shapes import clamp_weights, facet_normal, intersect_triangle, max_abs
+
+if TYPE_CHECKING:
+    from warp_reflect.wide_tree import WideTree
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FINITE_FLAGS})
 FREE, OWN, ONWARD, BOUNCED = (
@@ -560,6 +564,7 @@ class Fit:
         points = wp.array(scene.points_at_rest, dtype=wp.vec3, device=scene.device)
         of_triangle = wp.array(groups, dtype=wp.int32, device=scene.device)
         self.mesh = wp.Mesh(points, indices, bvh_constructor="sah", groups=of_triangle)
+        self.wide: WideTree | None = None
         self._fitted: wp.array | None = None
 
     def to(self, points: wp.array | None) -> None:
@@ -567,6 +572,8 @@ class Fit:
         if points is not None and self._fitted is not points:
             wp.copy(self.mesh.points, points)
             self.mesh.refit()
+            if self.wide is not None:
+                self.wide.fit()
         self._fitted = points
 
 
@@ -583,6 +590,7 @@ class Tracer:
         # Not the scene itself, which owns this: the pair would wait for the garbage collector, a scene a frame.
         self._device, self._view, self.origin = scene.device, scene.view, scene.origin
         self._mesh: wp.Mesh | None = None
+        self._wide: WideTree | None = None
         self._fit: Fit | None = None
         triangles = scene.host_triangles
         if part is not None:
@@ -607,6 +615,18 @@ class Tracer:
             self._fit.to(self._view.points)
         return self._mesh.id if self._mesh is not None else 0
 
+    @property
+    def packets(self) -> int:
+        """Handle for the snippets of `wide_packets.py`, 0 as `id` is; on the CPU only, laid out at first use."""
+        if self.id == 0:
+            return 0
+        owner, name = (self, "_wide") if self._fit is None else (self._fit, "wide")
+        if getattr(owner, name) is None:
+            from warp_reflect.wide_tree import WideTree  # not compiled where there are no packets
+
+            setattr(owner, name, WideTree(self._mesh))
+        return getattr(owner, name).id
+
     def at(self, scene: Scene) -> Tracer | None:
         """The same structure over the same stage's scene at another time, in which nothing but places differs; None: anew."""
         if self._fit is None:
@@ -621,6 +641,8 @@ class Tracer:
             self._fit.to(None)
         elif self._mesh is not None:
             self._mesh.refit()
+            if self._wide is not None:
+                self._wide.fit()
 
     def trace(
         self, origins, directions, threads: int = 0, without: OwnBody | None = None
@@ -710,7 +732,7 @@ def trace_pixels(
         int(index is not None),
     ]
     outputs = [layer.triangle, layer.u, layer.v, layer.distance, layer.status]
-    known = _first_met(scene.mirror_tracer(part), pixels, layer, index, threads, kernels)
+    known = _first_met(scene.mirror_tracer(part), pixels, layer, index, threads, kernels, gbuffer.camera.size[0])
     inputs = [*rays, known, *outputs]
     launch.launch(trace_pixels_kernel, count, inputs, scene.device, threads, split_min=TRACE_SPLIT_MIN)
     # The neighbours' answers are read from a copy, so that the order of threads cannot matter.
@@ -730,6 +752,7 @@ def _first_met(
     index: wp.array | None,
     threads: int,
     kernels: str,
+    width: int = 0,
 ) -> int:
     """Leave what rays meet first in a layer's arrays, where there are packets for it: 1, else 0."""
     if not vector.chosen(kernels, layer.triangle.device):
@@ -737,7 +760,9 @@ def _first_met(
     from warp_reflect import bvh_vector  # not compiled where it is not asked for
 
     rays = [pixels.point, pixels.normal, pixels.direction]
-    bvh_vector.first_met(tracer.id, rays, index, [layer.triangle, layer.u, layer.v, layer.distance], threads)
+    if index is None and width > 0:
+        index = bvh_vector.in_tiles(pixels.pixel, width, threads)
+    bvh_vector.first_met(tracer.packets, rays, index, [layer.triangle, layer.u, layer.v, layer.distance], threads)
     return 1
 
 

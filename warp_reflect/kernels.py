@@ -36,7 +36,7 @@ ROWS = {
         "-techniques.local_shading",
         "-techniques.local_map",
     ),
-    "raytraced": ("bvh", "|bvh_vector"),
+    "raytraced": ("bvh", "|wide_tree", "|bvh_vector"),
     "refinement": ("|techniques.refine_vector", "-techniques.refine"),
     "grid": ("techniques.interpolation",),
     "second_bounce": ("bounces", "bvh/bounced"),
@@ -69,7 +69,7 @@ def of_view(settings: Settings, device: wp.DeviceLike, casting: bool = False, mi
     if mirrors:
         asked += ["surface"]
     if casting:
-        asked += ["direct", "shadow_starts", "|shadows_vector", "-shadows/tried"]
+        asked += ["direct", "shadow_starts", "|wide_tree", "|shadows_vector", "-shadows/tried"]
     return _of(asked, vectors(settings, device))
 
 

@@ -460,7 +460,7 @@ def shadowed_irradiance(
     if vector.chosen(kernels, device):
         from warp_reflect import shadows_vector  # which sends this module's rays
 
-        send = shadows_vector.irradiance
+        send, mesh = shadows_vector.irradiance, wp.uint64(scene.shadow_tracer.packets)
     send(mesh, lights, [distant, areas], starts, count, samples, around, result, threads)
     return result
 
@@ -513,7 +513,7 @@ def sky_share(
     if vector.chosen(kernels, device):
         from warp_reflect import shadows_vector
 
-        shadows_vector.sky_share(mesh, starts, count, samples, result, threads)
+        shadows_vector.sky_share(wp.uint64(scene.shadow_tracer.packets), starts, count, samples, result, threads)
         return result
     inputs = [mesh, starts, samples, result]
     launch.launch(sky_share_kernel, count, inputs, device, threads, split_min=TRACE_SPLIT_MIN)
@@ -545,7 +545,7 @@ def light_shares(
     if vector.chosen(kernels, device):
         from warp_reflect import shadows_vector
 
-        shadows_vector.shares(mesh, direct, starts, count, samples, share, threads)
+        shadows_vector.shares(wp.uint64(scene.shadow_tracer.packets), direct, starts, count, samples, share, threads)
     else:
         inputs = [mesh, direct, starts, samples, share]
         launch.launch(light_shares_kernel, count, inputs, device, threads, split_min=TRACE_SPLIT_MIN)

@@ -1,6 +1,6 @@
 """The rays of `shadows.py`'s kernels for a block of points at a time.
 
-The same rays, to the last bit, in packets (`packets.py`): those of neighbouring points towards the same sample, or a point's
+The same rays, to the last bit, in packets (`wide_packets.py`): those of neighbouring points towards the same sample, or a point's
 own samples.
 """
 
@@ -11,7 +11,6 @@ import warp as wp
 from warp_reflect import vector
 from warp_reflect.direct import CYLINDER, SPHERE, DirectView
 from warp_reflect.launch import FINITE_FLAGS, launch
-from warp_reflect.packets import TRAVERSAL
 from warp_reflect.shadow_neighbours import (
     DARK,
     FLATNESS,
@@ -26,6 +25,7 @@ from warp_reflect.shadow_neighbours import (
     Neighbours,
 )
 from warp_reflect.shadow_starts import Starts
+from warp_reflect.wide_packets import TRAVERSAL
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FINITE_FLAGS})
 
@@ -448,7 +448,7 @@ def irradiance(
     """As `shadows.first_rays_kernel`, `shadows.shared_rays_kernel` and `shadows.shadowed_kernel`.
 
     Args:
-        mesh: What casts shadows.
+        mesh: `bvh.Tracer.packets` of what casts shadows.
         lights: Distant ones and shapes.
         cast: Which of either cast shadows.
         starts: From `shadow_starts.starts_of`.
