@@ -56,11 +56,15 @@ def applies(scene: Scene, reflector) -> tuple[bool, str]:
 
 
 def centre_of(scene: Scene, part: int) -> np.ndarray:
-    """Middle of a part's box, world, float64 [3]."""
-    own = scene.parts[part]
-    faces = scene.host_triangles[own.first_triangle : own.first_triangle + own.triangle_count]
-    points = scene.host_points[np.unique(faces)].astype(np.float64) if len(faces) else np.zeros((1, 3))
-    return 0.5 * (points.min(axis=0) + points.max(axis=0)) + scene.origin
+    """Middle of a part's box, world, float64 [3]; kept with the scene."""
+    key = ("centre", None, part)  # of this time alone
+    if key not in scene.facts:
+        own = scene.parts[part]
+        faces = scene.host_triangles[own.first_triangle : own.first_triangle + own.triangle_count]
+        points = scene.host_points[faces.reshape(-1)] if len(faces) else np.zeros((1, 3))
+        low, high = (bound.astype(np.float64) for bound in (points.min(axis=0), points.max(axis=0)))
+        scene.facts[key] = 0.5 * (low + high) + scene.origin
+    return scene.facts[key].copy()
 
 
 def left_out(scene: Scene, part: int, settings: Settings) -> tuple[int, ...]:
@@ -84,8 +88,15 @@ def vehicle_of(scene: Scene, part: int, settings: Settings) -> tuple[int, ...]:
         settings: `local_own_size`.
 
     Returns:
-        The parts, without the mirror; none where it does not move.
+        The parts, without the mirror; none where it does not move. Kept with the scene.
     """
+    key = ("vehicle", None, part, settings.local_own_size)  # of this time alone
+    if key not in scene.facts:
+        scene.facts[key] = _vehicle(scene, part, settings)
+    return scene.facts[key]
+
+
+def _vehicle(scene: Scene, part: int, settings: Settings) -> tuple[int, ...]:
     instances, own = scene.data.instances, scene.parts[part]
     by, copy = instances[own.prim - 1].mover, own.instance
     if not by or settings.local_own_size == 0.0:

@@ -8,7 +8,7 @@ each tells which map an element is of.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 import warp as wp
@@ -151,6 +151,12 @@ class LocalMaps:
     @property
     def count(self) -> int:
         return len(self.centres)
+
+    @cached_property
+    def eyes(self) -> wp.array:
+        """Their centres, scene frame, vec3 [maps]."""
+        centres = (self.centres - self.scene.origin).astype(np.float32)
+        return wp.array(centres, dtype=wp.vec3, device=self.scene.device)
 
     def cube_map(self, k: int) -> tuple[CubeMaps, wp.array]:
         """(Map k, which shares these arrays; the state of its texels)."""
