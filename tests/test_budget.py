@@ -215,7 +215,12 @@ def test_contradicting_requests_say_which_gave_way(ball_room):
 
 
 def test_reference_is_never_traded(ball_room):
-    assert planned(ball_room, "reference", budget_ms=0.01).rows[0].technique == "raytraced"
+    plan = planned(ball_room, "reference", budget_ms=0.01)
+    assert plan.rows[0].technique == "raytraced"
+    assert [note for note in plan.notes if "budget_ms=0.01 gave way: method=reference" in note.text]
+    again = keep_pace(plan, plan, Spent(1.0, 1.0))
+    assert sum("gave way" in note.text for note in again.notes) == 1
+    assert not [note for note in planned(ball_room, "reference", budget_ms=1e5).notes if "gave way" in note.text]
 
 
 def test_larger_budget_is_never_less_accurate(ball_room):

@@ -761,8 +761,13 @@ def _fit(made: Plan, pace: choice.Pace, keep: Plan | None = None) -> None:
         pace: What is known of how long things take.
         keep: A plan of the same request whose choice stands, where it is one of this plan's.
     """
-    settings, scene = made.settings, made.scene
-    if made.method == "reference" or not (settings.max_error_px > 0.0 or settings.budget_ms > 0.0):
+    settings = made.settings
+    if not (settings.max_error_px > 0.0 or settings.budget_ms > 0.0):
+        return
+    if made.method == "reference":
+        ms, budget = made.predicted["ms"], settings.budget_ms
+        told = f"budget_ms={budget:g} gave way: method=reference traces every mirror, in {ms:.3g} ms (predicted)"
+        _tell(made, [told] if 0.0 < budget < ms else [])
         return
     rows = {row.reflector.id: row for row in made.rows if row.pixels >= max(settings.few_pixels, 1)}
     if not made._ways:
@@ -790,9 +795,14 @@ def _fit(made: Plan, pace: choice.Pace, keep: Plan | None = None) -> None:
             continue
         reason = chosen.reasons[row.reflector.id]
         made.rows[k] = _changed(made, row, option.technique, option.settings, reason, option.predicted)
-    kept = made.notes[: len(made.notes) - made._told]
-    made.notes, made._told = kept + [Note(scene.data.source, text) for text in chosen.notes], len(chosen.notes)
+    _tell(made, chosen.notes)
     made.pace = pace
+
+
+def _tell(made: Plan, texts: list[str]) -> None:
+    """Notes of the request for an error or a time, in place of those told before."""
+    kept = made.notes[: len(made.notes) - made._told]
+    made.notes, made._told = kept + [Note(made.scene.data.source, text) for text in texts], len(texts)
 
 
 def _changed(plan: Plan, row: PlanRow, technique, settings, reason, predicted, forced: bool = False) -> PlanRow:
