@@ -201,7 +201,8 @@ class Settings:
     shadow_min_share: float = 0.001
     """`shadows=auto`: a light casts shadows where they take at least this share of all light off what is seen."""
     shadow_samples: int = 16
-    """Rays from a point towards a shape, or into a dome; a penumbra's error falls with their 3/4th power."""
+    """Rays from a point towards a shape, or into a dome. A penumbra's error falls with their 3/4th power where each point sends
+    all, with their 2/3rd to half where neighbours share: 16 leave 0.041 rms of a shape in `one_mirror`, unshared 0.055."""
     shadow_sharing: str = "on"
     """`on`: from a shape's penumbra a quarter of `shadow_samples` is sent, and neighbouring pixels of one plane share what it
     finds, where it is wide; or `off`: each sends all."""
