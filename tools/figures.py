@@ -161,7 +161,7 @@ FIGURES = {
     "peers": Figure(
         "Other renderers",
         "peers.py",
-        (*SCENES, "--size", SIZES[1], "--threads", "2", "--rounds", "5"),
+        (*SCENES, "--size", SIZES[1], "--threads", "2", "--rounds", "3", "--converged", "16"),
         ("usd_scenes/sphere_on_checker.usda", "--size", "96x54", "--rounds", "1"),
         {
             "scene": word("stage"),

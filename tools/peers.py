@@ -63,6 +63,9 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--shadows", default="none,lights,all", help=f"some of {','.join(LIGHTING)}, for --compare")
     parser.add_argument("--rounds", type=int, default=5, help="timed rounds, after two for warm-up")
     parser.add_argument("--peer-samples", type=int, default=4, help="samples a pixel of Mitsuba's timed pictures")
+    parser.add_argument(
+        "--converged", type=int, default=CONVERGED, help="samples a pixel of the pictures that timed ones are judged by"
+    )
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument(
         "--light-shadows", default="none", choices=LIGHTING, help="which lights' shadows both cast in timed pictures"
@@ -331,7 +334,7 @@ def mitsuba_contenders(
     counter = iter(range(1, 1 << 30))
     if llvm:
         made = mitsuba_scene.convert(data, camera, size, mirrors)
-        judged = mitsuba_scene.direct_picture(made, CONVERGED, arguments.light_shadows, centred=True)
+        judged = mitsuba_scene.direct_picture(made, arguments.converged, arguments.light_shadows, centred=True)
         if first.layers:
             rays = MitsubaRays(scene, first)
             what = f"{LLVM}, the mirror rays given"
@@ -353,7 +356,7 @@ def mitsuba_contenders(
         own = mitsuba_scene.convert(data, camera, size, mirrors, samples, ideal=True)
         loaded = mi.load_dict(own.whole({"type": "path", "max_depth": PATH_DEPTH, "hide_emitters": False}))
         if "path" not in converged:
-            spp = CONVERGED if variant == LLVM else SCALAR_CONVERGED
+            spp = arguments.converged if variant == LLVM else min(arguments.converged, SCALAR_CONVERGED)
             converged["path"] = np.array(loaded.integrator().render(loaded, spp=spp))[..., :3]
 
         def path(loaded=loaded, variant=variant):
