@@ -57,6 +57,7 @@ ARITHMETIC = re.compile(
 )
 LONGEST = 30  # times its share of the steps, that the first element of a launch may take
 PEAK_ROUNDS = 5
+STUCK_SECONDS = 300  # stepping 100,000 instructions takes one
 FMA_LOOPS, CLOCK_LOOPS = 400_000, 10_000_000
 TRIAD_NEAR, TRIAD_FAR = 2048, 16_000_000  # floats of each array
 TRIAD_BYTES = 4_000_000_000  # moved in a round, and a tenth of it beyond the caches
@@ -184,6 +185,8 @@ def main() -> None:
     arguments = parser.parse_args()
     if not sys.platform.startswith("linux") or os.uname().machine != "x86_64" or not shutil.which("objdump"):
         sys.exit("instructions are counted by ptrace and told by objdump: this needs Linux on x86-64 and binutils")
+    if not may_trace():
+        sys.exit("this system does not let a process be traced by its parent (ptrace)")
     wp.config.log_level = wp.LOG_WARNING
     peaks = measured_peaks()
     rows = [row for stage in arguments.stages for row in bench(stage, arguments, peaks)]
@@ -366,13 +369,20 @@ def count_instructions(kernel, dim: int, inputs, steps: int, work: Work, rng, la
     offsets = rng.permutation(dim) if dim <= steps else rng.integers(0, dim, steps)
     child = os.fork()
     if child == 0:
-        _ptrace()(TRACEME, 0, None, None)
-        os.kill(os.getpid(), signal.SIGSTOP)
-        for offset in offsets:
-            launch(kernel, dim=1, inputs=[inputs[0] + int(offset), *inputs[1:]], device="cpu")
-        os._exit(0)
+        try:
+            # A lock that another thread held at the fork is never given back here.
+            signal.signal(signal.SIGALRM, signal.SIG_DFL)
+            signal.alarm(STUCK_SECONDS)
+            if _ptrace()(TRACEME, 0, None, None) == 0:
+                os.kill(os.getpid(), signal.SIGSTOP)
+                for offset in offsets:
+                    launch(kernel, dim=1, inputs=[inputs[0] + int(offset), *inputs[1:]], device="cpu")
+        finally:
+            os._exit(0)
     ptrace = _ptrace()
     _, state = os.waitpid(child, 0)
+    if not os.WIFSTOPPED(state):
+        raise PermissionError("this system does not let a process be traced by its parent (ptrace)")
     word = ptrace(PEEK_TEXT, child, entry, None)
     trap = (word & ~0xFF) | BREAKPOINT
     left = steps
@@ -404,6 +414,14 @@ def count_instructions(kernel, dim: int, inputs, steps: int, work: Work, rng, la
         if not (os.WIFEXITED(state) or os.WIFSIGNALED(state)):
             os.kill(child, signal.SIGKILL)
             os.waitpid(child, 0)
+
+
+def may_trace() -> bool:
+    """Whether this system lets a process be stepped by its parent."""
+    child = os.fork()
+    if child == 0:
+        os._exit(0 if _ptrace()(TRACEME, 0, None, None) == 0 else 1)
+    return os.waitpid(child, 0)[1] == 0
 
 
 def disassembled(addresses: set[int]) -> dict[int, tuple[int, int]]:
