@@ -113,6 +113,22 @@ def radiance_point(x: wp.vec3) -> CubePoint:
     return point
 
 
+# `radiance_direction` for vectors of texels of one face, after `vector.snippet`'s head.
+RADIANCE_DIRECTION = r"""
+    auto radiance_direction = [&](int face, F u, F v) -> V {
+        const F one = F(1.0f);
+        switch (face) {
+            case 0: return V{one, -v, u};
+            case 1: return V{-one, -v, -u};
+            case 2: return V{u, one, -v};
+            case 3: return V{u, -one, v};
+            case 4: return V{-u, -v, one};
+            default: return V{u, -v, -one};
+        }
+    };
+"""
+
+
 @wp.func
 def radiance_direction(face: int, u: float, v: float) -> wp.vec3:
     """The direction of a position on a face of a radiance map, at length 1 along the face's axis."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import warp as wp
 
 from warp_reflect import vector
+from warp_reflect.cubemap import RADIANCE_DIRECTION
 from warp_reflect.grid_rays import FAR
 from warp_reflect.heightfield import HeightfieldView
 from warp_reflect.launch import FINITE_FLAGS
@@ -217,6 +218,7 @@ def sweep_groups_kernel(
 @wp.func_native(
     vector.snippet(
         WALK
+        + RADIANCE_DIRECTION
         + r"""
     const int square = n * n;
     const bool upwards = block * BLOCK < square;
@@ -228,15 +230,7 @@ def sweep_groups_kernel(
         const F u = (2.0f * __builtin_convertvector(start - row * n + lanes(), F) + 1.0f) / edge - 1.0f;
         const F v = F((2.0f * (float)(row) + 1.0f) / edge - 1.0f);
         const F one = F(1.0f);
-        V towards;
-        switch (face) {
-            case 0: towards = V{one, -v, u}; break;
-            case 1: towards = V{-one, -v, -u}; break;
-            case 2: towards = V{u, one, -v}; break;
-            case 3: towards = V{u, -one, v}; break;
-            case 4: towards = V{-u, -v, one}; break;
-            default: towards = V{u, -v, -one}; break;
-        }
+        V towards = radiance_direction(face, u, v);
         if (field.place.up == 1) { const F y = towards.y; towards.y = towards.z; towards.z = y; }
         I walking = I(-1);
         if (upwards) {

@@ -8,6 +8,7 @@ from __future__ import annotations
 import warp as wp
 
 from warp_reflect import vector
+from warp_reflect.cubemap import RADIANCE_DIRECTION
 from warp_reflect.environment_maps import PALETTE, CubeMapsView
 from warp_reflect.scene import SceneView
 from warp_reflect.shade import LightView
@@ -34,7 +35,8 @@ EVERY = wp.constant(wp.uint64(0xFFFFFFFFFFFFFFFF))  # texel of a block
 
 @wp.func_native(
     vector.snippet(
-        r"""
+        RADIANCE_DIRECTION
+        + r"""
     typedef float Texel __attribute__((ext_vector_type(4)));
     const int begin = block * BLOCK;
     const int n = place.resolution;
@@ -64,15 +66,7 @@ EVERY = wp.constant(wp.uint64(0xFFFFFFFFFFFFFFFF))  # texel of a block
         const F u = (2.0f * __builtin_convertvector(column, F) + 1.0f) / (float)(n) - 1.0f;
         const F v = F((2.0f * (float)(row) + 1.0f) / (float)(n) - 1.0f);
         const F one = F(1.0f);
-        V towards;
-        switch (face) {
-            case 0: towards = V{one, -v, u}; break;
-            case 1: towards = V{-one, -v, -u}; break;
-            case 2: towards = V{u, one, -v}; break;
-            case 3: towards = V{u, -one, v}; break;
-            case 4: towards = V{-u, -v, one}; break;
-            default: towards = V{u, -v, -one}; break;
-        }
+        const V towards = radiance_direction(face, u, v);
         F depth = 1.0f / pick(there, inv, one);
         F off = F(slack);
         const I tri = iload(triangle.data + start);

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warp as wp
 
 from warp_reflect import vector
+from warp_reflect.cubemap import RADIANCE_DIRECTION
 from warp_reflect.techniques.local_maps import LocalPlace
 from warp_reflect.techniques.local_shading import (
     ASKED,
@@ -93,6 +94,7 @@ def count_rows_kernel(
 @wp.func_native(
     vector.snippet(
         ROW
+        + RADIANCE_DIRECTION
         + r"""
     const V eye = spread(place.eye);
     int columns[LANES];
@@ -103,15 +105,7 @@ def count_rows_kernel(
         const F u = (2.0f * __builtin_convertvector(own, F) + 1.0f) / (float)(n) - 1.0f;
         const F v = F((2.0f * (float)(y) + 1.0f) / (float)(n) - 1.0f);
         const F one = F(1.0f);
-        V towards;
-        switch (face) {
-            case 0: towards = V{one, -v, u}; break;
-            case 1: towards = V{-one, -v, -u}; break;
-            case 2: towards = V{u, one, -v}; break;
-            case 3: towards = V{u, -one, v}; break;
-            case 4: towards = V{-u, -v, one}; break;
-            default: towards = V{u, -v, -one}; break;
-        }
+        const V towards = radiance_direction(face, u, v);
         const F length = __builtin_elementwise_sqrt(dot(towards, towards));
         const V d = V{towards.x / length, towards.y / length, towards.z / length};
         const I tri = igather(triangle.data + start, own);
