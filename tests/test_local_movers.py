@@ -120,7 +120,7 @@ def test_texels_show_the_moving_triangles_that_their_rays_meet(tmp_path, edge, d
     local_movers._movers(first)
     later = first.at(3.0)
     layered_environment.take_over(first, later)
-    assert local_movers._movers(later).tree is local_movers._movers(first).tree
+    assert local_movers._movers(later).known is local_movers._movers(first).known
     directions = texel_directions(edge).reshape(-1, 3)
     directions = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).astype(np.float32)
     settings = wr.Settings(shadows="off", bounces=1, threads=1)

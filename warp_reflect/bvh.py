@@ -553,31 +553,56 @@ def trace_bounced_kernel(
     out_status[i] = wp.uint8(hit.status)
 
 
-class Fit:
-    """A structure that tracers of several times share: its tree is built once, and fitted to the points of who asks.
+class Tree:
+    """Triangles in a BVH, laid out once and fitted to the points of who asks; several times of a stage may share one.
 
-    The tree follows from what stands still and from the shapes of what moves, each in a branch of its own, wherever that
-    stands: rays meet the same at a time whichever was looked at before.
+    Attributes:
+        mesh: Owner of the structure.
     """
 
-    def __init__(self, scene: Scene, indices: wp.array):
-        groups = np.zeros(scene.triangle_count, np.int32)
-        for part in (scene.parts[k] for k in scene.moving_parts):
-            groups[part.first_triangle : part.first_triangle + part.triangle_count] = part.prim
-        points = wp.array(scene.points_at_rest, dtype=wp.vec3, device=scene.device)
-        of_triangle = wp.array(groups, dtype=wp.int32, device=scene.device)
-        self.mesh = wp.Mesh(points, indices, bvh_constructor="sah", groups=of_triangle)
-        self.wide: WideTree | None = None
-        self._fitted: wp.array | None = None
+    def __init__(self, points: wp.array, indices: wp.array, groups: np.ndarray | None = None):
+        """Lay it out after points, which it keeps; `groups`: of every triangle, each in a branch of its own."""
+        constructor = "lbvh" if points.device.is_cuda else "sah"
+        of_triangle = None if groups is None else wp.array(groups, dtype=wp.int32, device=points.device)
+        self.mesh = wp.Mesh(points, indices, bvh_constructor=constructor, groups=of_triangle)
+        self._wide: WideTree | None = None
+        self._fitted: wp.array | None = points
 
-    def to(self, points: wp.array | None) -> None:
-        """Fit it to the points of a scene, if it is not; None: whatever it is asked for next."""
-        if points is not None and self._fitted is not points:
-            wp.copy(self.mesh.points, points)
+    def to(self, points: wp.array) -> Tree:
+        """Fit it to points, if it is not."""
+        if self._fitted is not points:
+            if self.mesh.points is not points:
+                wp.copy(self.mesh.points, points)
             self.mesh.refit()
-            if self.wide is not None:
-                self.wide.fit()
-        self._fitted = points
+            if self._wide is not None:
+                self._wide.fit()
+            self._fitted = points
+        return self
+
+    def loosen(self) -> None:
+        """Points were moved in place: it is fitted when it is asked for next."""
+        self._fitted = None
+
+    @property
+    def packets(self) -> int:
+        """Handle for the snippets of `wide_packets.py`; on the CPU only, laid out at first use."""
+        if self._wide is None:
+            from warp_reflect.wide_tree import WideTree  # not compiled where there are no packets
+
+            self._wide = WideTree(self.mesh)
+        return self._wide.id
+
+
+def _resting(scene: Scene, indices: wp.array) -> Tree:
+    """A tree for all times of a stage.
+
+    It follows from what stands still and from the shapes of what moves, each in a branch of its own, wherever that stands: rays
+    meet the same at a time whichever was looked at before.
+    """
+    groups = np.zeros(scene.triangle_count, np.int32)
+    for part in (scene.parts[k] for k in scene.moving_parts):
+        groups[part.first_triangle : part.first_triangle + part.triangle_count] = part.prim
+    return Tree(wp.array(scene.points_at_rest, dtype=wp.vec3, device=scene.device), indices, groups)
 
 
 class Tracer:
@@ -592,9 +617,9 @@ class Tracer:
     def __init__(self, scene: Scene, part: int | None = None, seen: np.ndarray | None = None):
         # Not the scene itself, which owns this: the pair would wait for the garbage collector, a scene a frame.
         self._device, self._view, self.origin = scene.device, scene.view, scene.origin
-        self._mesh: wp.Mesh | None = None
-        self._wide: WideTree | None = None
-        self._fit: Fit | None = None
+        self._tree: Tree | None = None
+        # What moves is in a tree that tracers of all times share.
+        self._shared = part is None and bool(scene.moving_parts) and not scene.device.is_cuda
         triangles = scene.host_triangles
         if part is not None:
             own = scene.parts[part]
@@ -605,38 +630,24 @@ class Tracer:
         if len(triangles):
             # The traversal wants flat indices. Copied: the structure's memory must not move.
             indices = wp.array(triangles.reshape(-1), dtype=wp.int32, device=scene.device)
-            if part is None and scene.moving_parts and not scene.device.is_cuda:
-                self._fit = Fit(scene, indices)
-                self._mesh = self._fit.mesh
-            else:
-                constructor = "lbvh" if scene.device.is_cuda else "sah"
-                self._mesh = wp.Mesh(scene.view.points, indices, bvh_constructor=constructor)
+            self._tree = _resting(scene, indices) if self._shared else Tree(scene.view.points, indices)
 
     @property
     def id(self) -> int:
-        if self._fit is not None:
-            self._fit.to(self._view.points)
-        return self._mesh.id if self._mesh is not None else 0
-
-    def pays(self, count: int) -> bool:
-        """Whether packets of so many rays are worth it: of a scene that moves their tree is fitted again at every time."""
-        return self._fit is None or count >= RAYS_A_TRIANGLE * len(self._fit.mesh.indices) // 3
+        return 0 if self._tree is None else self._tree.to(self._view.points).mesh.id
 
     @property
     def packets(self) -> int:
-        """Handle for the snippets of `wide_packets.py`, 0 as `id` is; on the CPU only, laid out at first use."""
-        if self.id == 0:
-            return 0
-        owner, name = (self, "_wide") if self._fit is None else (self._fit, "wide")
-        if getattr(owner, name) is None:
-            from warp_reflect.wide_tree import WideTree  # not compiled where there are no packets
+        """Handle for the snippets of `wide_packets.py`, 0 as `id` is; on the CPU only."""
+        return 0 if self._tree is None else self._tree.to(self._view.points).packets
 
-            setattr(owner, name, WideTree(self._mesh))
-        return getattr(owner, name).id
+    def pays(self, count: int) -> bool:
+        """Whether packets of so many rays are worth it: of a scene that moves their tree is fitted again at every time."""
+        return not self._shared or count >= RAYS_A_TRIANGLE * (len(self._tree.mesh.indices) // 3)
 
     def at(self, scene: Scene) -> Tracer | None:
         """The same structure over the same stage's scene at another time, in which nothing but places differs; None: anew."""
-        if self._fit is None:
+        if not self._shared:
             return None
         other = copy.copy(self)
         other._view, other.origin = scene.view, scene.origin
@@ -644,12 +655,8 @@ class Tracer:
 
     def refit(self) -> None:
         """Fit the structure to points that were moved in place."""
-        if self._fit is not None:
-            self._fit.to(None)
-        elif self._mesh is not None:
-            self._mesh.refit()
-            if self._wide is not None:
-                self._wide.fit()
+        if self._tree is not None:
+            self._tree.loosen()
 
     def trace(
         self, origins, directions, threads: int = 0, without: OwnBody | None = None
@@ -672,7 +679,7 @@ class Tracer:
         n = len(origins)
         triangle = wp.full(n, -1, dtype=int, device=device)
         t, u, v = (wp.zeros(n, dtype=float, device=device) for _ in range(3))
-        if self._mesh is not None:
+        if self._tree is not None:
             inputs = [wp.uint64(self.id), self._view, origins, directions, without or OwnBody(), triangle, t, u, v]
             launch.launch(trace_kernel, n, inputs, device, threads)
         return triangle, t, u, v

@@ -18,9 +18,9 @@ RAYS = r"""
     };
     // One component of three, each lane its own.
     auto component = [&](I axis, F x, F y, F z) -> F { return pick(axis == 0, x, pick(axis == 1, y, z)); };
-    struct Ray { V o, inverse; F sx, sy, sz, ox, oy, oz; I kx, ky, kz, zero_x, zero_y, zero_z; };
-    auto ray_of = [&](V o, V d) -> Ray {
-        Ray r;
+    struct Way { V o, inverse; F sx, sy, sz, ox, oy, oz; I kx, ky, kz, zero_x, zero_y, zero_z; };
+    auto way_of = [&](V o, V d) -> Way {
+        Way r;
         r.o = o;
         r.zero_x = d.x == 0.0f; r.zero_y = d.y == 0.0f; r.zero_z = d.z == 0.0f;
         r.inverse = V{1.0f / pick(r.zero_x, F(1.0e-20f), d.x), 1.0f / pick(r.zero_y, F(1.0e-20f), d.y),
@@ -62,7 +62,7 @@ RAYS = r"""
     // `a`, `b`, `c`: x of the corners, the other numbers STRIDE after one another. `nearest`: what is met replaces `best`;
     // otherwise only its face does.
     auto meet_triangle = [&](auto nearest, auto stride, int face, const float* a, const float* b, const float* c,
-                             const Axes& axes, const Ray& r, I asked, Met& best) -> I {
+                             const Axes& axes, const Way& r, I asked, Met& best) -> I {
         constexpr int STRIDE = decltype(stride)::value;
         F a_x, a_y, a_z, b_x, b_y, b_z, c_x, c_y, c_z;
         if (axes.one) {

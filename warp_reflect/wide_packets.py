@@ -39,10 +39,10 @@ TRAVERSAL = (
     auto traverse = [&](auto nearest, auto groups, const I* live, const V* o, const V* d, const F* reach, Met* met) {
         constexpr int GROUPS = decltype(groups)::value;
         constexpr bool NEAREST = decltype(nearest)::value;
-        Ray ray[GROUPS];
+        Way ray[GROUPS];
         I left[GROUPS], octant[GROUPS];
         EACH_GROUP {
-            ray[g] = ray_of(o[g], d[g]);
+            ray[g] = way_of(o[g], d[g]);
             left[g] = live[g];
             met[g] = Met{I(-1), reach[g], F(0.0f), F(0.0f)};
             octant[g] = ipick(d[g].x < 0.0f, I(1), I(0)) + ipick(d[g].y < 0.0f, I(2), I(0)) + ipick(d[g].z < 0.0f, I(4), I(0));
@@ -63,7 +63,7 @@ TRAVERSAL = (
             }
             if (signs < 0) return;
             EACH_GROUP {
-                const Ray& r = ray[g];
+                const Way& r = ray[g];
                 mask[g] = left[g] & (octant[g] == signs);
                 left[g] &= ~mask[g];
                 axes.one &= !bits(mask[g] & ((r.kz != axes.z) | (r.kx != axes.x)));
@@ -110,7 +110,7 @@ TRAVERSAL = (
                 leave = last < leave ? last : leave;
             };
             float far = most([&](int g) { return met[g].t; });
-            auto box = [&](const Ray& r, F far, const float* of) -> I {
+            auto box = [&](const Way& r, F far, const float* of) -> I {
                 F enter, leave;
                 if (no_zeros) {
                     enter = (of[down_x ? 24 : 0] - r.o.x) * r.inverse.x;

@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 import warp as wp
 
-from warp_reflect import launch, vector
+from warp_reflect import bvh, launch, vector
 from warp_reflect.cubemap import FACE_COUNT, radiance_direction
 from warp_reflect.environment_maps import CubeMaps, Onward
 from warp_reflect.launch import FINITE_FLAGS
@@ -39,27 +39,25 @@ MOVING = wp.constant(local_shading.TEXEL_MOVING)
 
 
 @dataclass
-class Tree:
-    """A tree over the moving triangles of a stage, each part in a branch of its own: the same at every time.
+class Moving:
+    """The moving triangles of a stage: the same at every time.
 
     Attributes:
-        mesh: Of them.
+        tree: Over them, each part in a branch of its own.
         vertex: Numbers of its points in the scene, int [m].
         number: Of its triangles in the scene, int [n].
         part: Of each, index into the scene's parts, int [n].
-        fitted: The points that it is fitted to.
     """
 
-    mesh: wp.Mesh
+    tree: bvh.Tree
     vertex: np.ndarray
     number: np.ndarray
     part: np.ndarray
-    fitted: wp.array | None = None
 
     @cached_property
     def on_device(self) -> wp.array:
         """`number`, on the device."""
-        return wp.array(self.number.astype(np.int32), dtype=int, device=self.mesh.device)
+        return wp.array(self.number.astype(np.int32), dtype=int, device=self.tree.mesh.device)
 
 
 @dataclass
@@ -67,13 +65,13 @@ class Movers:
     """What moves at one time of a stage.
 
     Attributes:
-        tree: Over it.
+        known: Of all times.
         points: Of the tree, scene frame.
         spheres: Around each part of the scene that moves, float32 [parts, 4]: middle, radius.
         row: Of a part in them.
     """
 
-    tree: Tree
+    known: Moving
     points: wp.array
     spheres: np.ndarray
     row: dict[int, int]
@@ -81,11 +79,7 @@ class Movers:
     @property
     def id(self) -> int:
         """Handle of the tree, fitted to what it was at this time."""
-        if self.tree.fitted is not self.points:
-            wp.copy(self.tree.mesh.points, self.points)
-            self.tree.mesh.refit()
-            self.tree.fitted = self.points
-        return self.tree.mesh.id
+        return self.known.tree.to(self.points).mesh.id
 
 
 def moving_in(scene: Scene, part: int, settings: Settings) -> tuple[int, ...]:
@@ -234,7 +228,7 @@ def meet_moving(scene: Scene, local: LocalMaps, parts: Sequence[tuple[int, ...]]
     if not len(asked):
         return
     made = wp.array(asked, dtype=Asked, device=device)
-    inputs = [wp.uint64(movers.id), movers.tree.on_device, made, wp.array(asked_first, dtype=int, device=device)]
+    inputs = [wp.uint64(movers.id), movers.known.on_device, made, wp.array(asked_first, dtype=int, device=device)]
     tiles = FACE_COUNT * (-(-np.array(local.layout.resolutions) // int(TILE))) ** 2
     tile_map = np.repeat(np.arange(len(tiles), dtype=np.int32), tiles)
     tile_first = (np.cumsum(tiles) - tiles).astype(np.int32)
@@ -300,9 +294,9 @@ def draw_moving(
 
 
 def take_over(earlier: Scene, scene: Scene) -> None:
-    """Hand the tree over to the same stage's scene at another time, whose triangles have the same numbers."""
+    """Hand what moves over to the same stage's scene at another time, whose triangles have the same numbers."""
     if (KEY,) in earlier.environments and (KEY,) not in scene.environments:
-        scene.environments[(KEY,)] = _at(scene, earlier.environments[(KEY,)].tree)
+        scene.environments[(KEY,)] = _at(scene, earlier.environments[(KEY,)].known)
 
 
 def _movers(scene: Scene) -> Movers:
@@ -317,18 +311,16 @@ def _movers(scene: Scene) -> Movers:
         device = scene.device
         points = wp.array(scene.host_points[vertex], dtype=wp.vec3, device=device)
         indices = wp.array(place[scene.host_triangles[number]].reshape(-1), dtype=wp.int32, device=device)
-        groups = wp.array(part, dtype=wp.int32, device=device)
-        mesh = wp.Mesh(points, indices, bvh_constructor="lbvh" if device.is_cuda else "sah", groups=groups)
-        scene.environments[(KEY,)] = _at(scene, Tree(mesh, vertex, number, part))
+        scene.environments[(KEY,)] = _at(scene, Moving(bvh.Tree(points, indices, part), vertex, number, part))
     return scene.environments[(KEY,)]
 
 
-def _at(scene: Scene, tree: Tree) -> Movers:
+def _at(scene: Scene, known: Moving) -> Movers:
     first, _, boxes = scene.boxes
     solid = [k for k in scene.moving_parts if scene.parts[k].triangle_count]
     corners = boxes[np.searchsorted(first, [scene.parts[k].first_vertex for k in solid])]
     middle = corners.mean(axis=1)
     radius = SPHERE_SLACK * np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
     spheres = np.column_stack([middle, radius]).astype(np.float32)
-    points = wp.array(scene.host_points[tree.vertex], dtype=wp.vec3, device=scene.device)
-    return Movers(tree, points, spheres, {k: row for row, k in enumerate(solid)})
+    points = wp.array(scene.host_points[known.vertex], dtype=wp.vec3, device=scene.device)
+    return Movers(known, points, spheres, {k: row for row, k in enumerate(solid)})

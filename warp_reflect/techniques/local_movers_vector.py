@@ -32,13 +32,13 @@ DESCENT = (
     constexpr int GROUPS = 2;
     // What rays from `o` along `d`, lanes `live` of them, meet first nearer than `reach`, below a node.
     auto first_met_by = [&](int node, const I* live, const V* o, const V* d, const F* reach, Met* met) {
-        Ray ray[GROUPS];
+        Way ray[GROUPS];
         I mask[GROUPS];
         bool no_zeros = true;
         Axes axes{true, -1, 0, 0};
         unsigned low_x = 0, low_y = 0, low_z = 0, high_x = 0, high_y = 0, high_z = 0;
         EACH_GROUP {
-            const Ray& r = ray[g] = ray_of(o[g], d[g]);
+            const Way& r = ray[g] = way_of(o[g], d[g]);
             mask[g] = live[g];
             met[g] = Met{I(-1), reach[g], F(0.0f), F(0.0f)};
             const unsigned all = bits(live[g]);
@@ -62,7 +62,7 @@ DESCENT = (
         const BVHPackedNodeHalf* out_x = low_x ? node_lowers : node_uppers;
         const BVHPackedNodeHalf* out_y = low_y ? node_lowers : node_uppers;
         const BVHPackedNodeHalf* out_z = low_z ? node_lowers : node_uppers;
-        auto box = [&](const Ray& r, F far, int node, F& enter) -> I {
+        auto box = [&](const Way& r, F far, int node, F& enter) -> I {
             F leave;
             if (one_way) {
                 enter = (in_x[node].x - r.o.x) * r.inverse.x;
