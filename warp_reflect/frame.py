@@ -25,7 +25,8 @@ from warp_reflect.channels import CHANNELS, POINTS, component_of, known_names, r
 from warp_reflect.choice import Spent
 from warp_reflect.effects import FINISHES, PANE_FINISHES, finish_of, moves_with_time
 from warp_reflect.layers import NO_REFLECTOR, Camera, GBuffer, MirrorPixels, ReflectionLayer, add_statistics
-from warp_reflect.planner import PaneRow, Plan, PlanRow, find_camera, keep_pace
+from warp_reflect.plan_rows import PaneRow, PlanRow
+from warp_reflect.planner import Plan, find_camera, keep_pace
 from warp_reflect.scene import Scene
 from warp_reflect.settings import Settings, Technique
 from warp_reflect.techniques import MAPS, TECHNIQUES

@@ -28,7 +28,6 @@ from warp_reflect.budget import (
     fixed_ms,
     lobe_ms,
     loss,
-    predict,
     scattered_ms,
     through_ms,
 )
@@ -36,68 +35,37 @@ from warp_reflect.direct import AREA_KINDS
 from warp_reflect.effects import (
     Effect,
     bounce_effect,
-    finish_effects,
     frost_rays,
     lobe_rays,
-    pane_effects,
     pane_rays,
-    refraction_effect,
 )
 from warp_reflect.launch import thread_count
-from warp_reflect.layers import Camera, GBuffer, Reflector
+from warp_reflect.layers import Camera, GBuffer
 from warp_reflect.lighting import LightRow, are_clear, needs_probe, plan_lights, shadows_of
+from warp_reflect.plan_rows import (
+    PaneRow,
+    PlanRow,
+    effects_of,
+    pane_of,
+    predicted_of,
+    row_of,
+    shadow_effect,
+)
 from warp_reflect.probe import EyeView, Probe, look, probe
-from warp_reflect.reflectors import interface_of, is_transparent, mirror_roughness, mirror_weight
+from warp_reflect.reflectors import is_transparent, mirror_roughness, mirror_weight
 from warp_reflect.scene import Note, PartRange, Scene
 from warp_reflect.settings import Settings
 from warp_reflect.shadows import Shadows
-from warp_reflect.techniques import MAPS, TECHNIQUES, TOGETHER
+from warp_reflect.techniques import TECHNIQUES, TOGETHER
 
 METHODS = ("auto", "reference", "none")
 OF_ALL_TIMES = ("layered_environment",)  # prepare something that holds nothing that moves
-REUSING = ("quadric", "reflector_map")  # know a bound on how far a virtual vertex drifts
 DEFAULT_SIZE = (960, 540)  # usdrecord's default width at 16:9
 # Of a time asked for: a frame that takes more is late, and what is dearer may be predicted to take as much; between them a
 # choice stands.
 LATE, ROOM = 1.05, 0.95
 GLANCE = 97  # pixels from one to the next that are asked for mirrors, so that kernels of theirs begin to compile early
 BETTER = 0.8  # of the error: what a dearer choice has to come down to, else the last one stands
-
-
-@dataclass(frozen=True)
-class PlanRow:
-    """What is simulated for one reflector."""
-
-    reflector: Reflector
-    path: str
-    subset: str
-    instance: str
-    technique: str
-    forced: bool
-    reason: str
-    pixels: int
-    effects: dict[str, Effect]
-    settings: Settings
-    predicted: dict[str, float]
-
-    @property
-    def name(self) -> str:
-        """The mirror's prim path, with which copy and which subset of it."""
-        return _name(self)
-
-
-@dataclass(frozen=True)
-class PaneRow:
-    """What is simulated for one transparent surface."""
-
-    part: int
-    path: str
-    subset: str
-    instance: str
-    interface: str  # "thin" or "solid"
-    pixels: int
-    effects: dict[str, Effect]
-    settings: Settings
 
 
 @dataclass(frozen=True)
@@ -306,7 +274,7 @@ class Plan:
         found = [PlanLine(f"{self.scene.data.source}  camera {self.camera.path}  {width}x{height}")]
         panes = []
         for pane in self.panes:
-            panes.append(PlanLine(f"pane {_name(pane)}  {pane.interface}  {pane.pixels:,d} pixels", pane))
+            panes.append(PlanLine(f"pane {pane.name}  {pane.interface}  {pane.pixels:,d} pixels", pane))
             panes += _effect_lines(pane)
         lights = []
         for light in self.lights:
@@ -340,11 +308,6 @@ def _effect_lines(row: PlanRow | PaneRow | LightRow) -> list[PlanLine]:
         PlanLine(f"    {'on ' if each.on else 'off'} {name}: {each.reason}", row, name)
         for name, each in row.effects.items()
     ]
-
-
-def _name(row: PlanRow | PaneRow) -> str:
-    """The surface's prim path, with which copy and which subset of it."""
-    return row.path + (f"[{row.instance}]" if row.instance else "") + (f":{row.subset}" if row.subset else "")
 
 
 def keep_pace(plan: Plan, before: Plan, spent: choice.Spent) -> Plan:
@@ -429,7 +392,7 @@ def make_plan(
     cast = shadows_of(lights, settings)
     drawn = settings.replace(shadows=cast is not None and cast.direct)
     rows = [
-        _row(scene, view, drawn, method, number, part_index, part, weight, pixels[part_index], notes, costs)
+        row_of(scene, view, drawn, method, number, part_index, part, weight, pixels[part_index], notes, costs)
         for number, (part_index, part, weight) in enumerate(found, 1)
     ]
     alone = len(rows) == 1 and rows[0].reflector.convex
@@ -443,8 +406,8 @@ def make_plan(
             how = [f"; {names[number]} by {technique} from the eye behind it" for number, technique in solved.items()]
             bounce = Effect(True, bounce.reason + "".join(how), bounce.numbers | {"solved": solved})
         row.effects["second_bounce"] = bounce
-        row.effects["shadows"] = _shadows(lights, visible)
-    panes = [_pane(scene, view, settings, method, k, pixels[k]) for k in clear]
+        row.effects["shadows"] = shadow_effect(lights, visible)
+    panes = [pane_of(scene, view, settings, method, k, pixels[k]) for k in clear]
     notes += rough if method != "none" else _too_rough(scene, settings, {})
     if settings.kernels != "plain" and not scene.device.is_cuda and vector.missing():
         notes.append(Note("", f"plain kernels only: {vector.missing()} (kernels={settings.kernels})"))
@@ -512,7 +475,7 @@ def _with_detail(scene, camera, settings, rows: list[PlanRow], earlier: Plan | N
             )
             own = row.settings.replace(local_resolution=level.resolution)
             ask = (scene, row.reflector, camera, row.technique, row.pixels, own, costs)
-            row = dataclasses.replace(row, settings=own, predicted=_predicted(*ask))
+            row = dataclasses.replace(row, settings=own, predicted=predicted_of(*ask))
         made.append(row)
     return made
 
@@ -564,7 +527,7 @@ def prefer_forward(plan: Plan, earlier: Plan | None = None) -> Plan:
         chosen = next(((name, reason) for name, applies, reason in held if applies), None)
         if row.technique == "raytraced" and not row.forced and plan.method == "auto" and chosen is not None:
             name, reason = chosen
-            predicted = _predicted(scene, row.reflector, camera, name, row.pixels, row.settings, plan.costs)
+            predicted = predicted_of(scene, row.reflector, camera, name, row.pixels, row.settings, plan.costs)
             reason = f"{reason}; for its virtual objects"
             row = dataclasses.replace(row, technique=name, reason=reason, predicted=predicted)
         rows.append(row)
@@ -588,7 +551,7 @@ def with_techniques(plan: Plan, techniques: Mapping[int, str]) -> Plan:
             applies, reason = applicable.applies(scene, row.reflector, plan.camera, name, row.settings)
             if applies:
                 ask = (scene, row.reflector, plan.camera, name, row.pixels, row.settings, plan.costs)
-                row = _changed(plan, row, name, row.settings, f"asked for; {reason}", _predicted(*ask), forced=True)
+                row = _changed(plan, row, name, row.settings, f"asked for; {reason}", predicted_of(*ask), forced=True)
             else:
                 notes.append(Note(row.path, f"{name} does not apply ({reason})"))
         rows.append(row)
@@ -670,89 +633,6 @@ def _tried(
     return tried, lights
 
 
-def _row(scene, camera, settings, method, number, part_index, part, weight, pixels, notes, costs) -> PlanRow:
-    looked_at = method != "auto" or pixels >= max(settings.few_pixels, 1)
-    reflector = Reflector(number, part_index, looked_at and scene.body(part_index).convex)
-    technique, forced, reason = _technique(scene, reflector, camera, method, pixels, settings, part, notes, costs)
-    if method == "reference":
-        settings = settings.replace(refine="off")
-    if technique == "layered_environment" and pixels:
-        told = TECHNIQUES[technique].plan_notes(scene, reflector, settings)
-        notes += [note for note in told if note not in notes]
-    return PlanRow(
-        reflector,
-        part.prim_path,
-        part.subset,
-        part.instance,
-        technique,
-        forced,
-        reason,
-        pixels,
-        _effects(scene, part, technique, pixels, weight, settings),
-        settings,
-        _predicted(scene, reflector, camera, technique, pixels, settings, costs),
-    )
-
-
-def _pane(scene, camera, settings, method, part_index, pixels) -> PaneRow:
-    part = scene.parts[part_index]
-    interface, reason = interface_of(scene, part_index)
-    effects = pane_effects(scene, part, interface, reason, pixels, settings, camera)
-    effects["refraction_image"] = refraction_effect(scene, part_index, interface, pixels, settings, camera, method)
-    return PaneRow(part_index, part.prim_path, part.subset, part.instance, interface, pixels, effects, settings)
-
-
-def _predicted(scene, reflector, camera, technique, pixels, settings, costs) -> dict:
-    work = applicable.work_of(scene, reflector, camera, technique, pixels, settings)
-    return predict(work, technique, settings, costs, thread_count(scene.device, settings.threads))
-
-
-def _technique(scene, reflector, camera, method, pixels, settings, part, notes, costs) -> tuple[str, bool, str]:
-    """(technique, forced, reason) of a reflector."""
-    if method == "reference":
-        return "raytraced", True, "the reference: every mirror is traced"
-    mirror = scene.data.materials[part.material].mirror
-    if method == "auto" and mirror is not None and mirror.technique != "auto":
-        if mirror.technique in TECHNIQUES:
-            method = mirror.technique
-        else:
-            known = ", ".join(TECHNIQUES)
-            notes.append(Note(part.prim_path, f"technique: got '{mirror.technique}', expected auto or one of {known}"))
-    if method != "auto":
-        applies, reason = applicable.applies(scene, reflector, camera, method, settings)
-        if applies:
-            return method, True, f"asked for; {reason}"
-        notes.append(Note(part.prim_path, f"{method} does not apply ({reason}); traced"))
-        return "raytraced", False, f"{method} was asked for but does not apply: {reason}"
-    if pixels == 0:
-        return "raytraced", False, "not seen from the plan's camera: nothing is done, and rays serve another camera"
-    if pixels < settings.few_pixels:
-        why = f"{pixels} pixels, fewer than few_pixels={settings.few_pixels}: rays are cheapest, its shape is not looked at"
-        return "raytraced", False, why
-    return _cheapest(scene, reflector, camera, pixels, settings, costs)
-
-
-def _cheapest(scene, reflector, camera, pixels, settings, costs) -> tuple[str, bool, str]:
-    """(technique, False, reason): the first exact one that applies, unless rays or a map of what is far are cheaper."""
-    threads = thread_count(scene.device, settings.threads)
-    found, refused = applicable.exact_candidates(scene, reflector, camera, pixels, settings, costs)
-    rays = _predicted(scene, reflector, camera, "raytraced", pixels, settings, costs)["ms"]
-    name, reason, least = "raytraced", "; ".join(refused), rays
-    if found:
-        name, reason = found[0].technique, found[0].reason
-        least = predict(found[0].work, name, settings, costs, threads)["ms"]
-        if rays < least:
-            reason = (
-                f"{reason}, but {pixels} pixels are traced in {rays:.1f} ms and {scene.vertex_count} vertices reflected "
-                f"in {least:.1f} ms (predicted)"
-            )
-            name, least = "raytraced", rays
-    far = applicable.far_environment(scene, reflector, camera, pixels, settings, settings.environment_px)
-    if far is not None and predict(far.work, far.technique, settings, costs, threads)["ms"] < least:
-        return far.technique, False, f"{far.reason} (at most environment_px={settings.environment_px:g})"
-    return name, False, reason
-
-
 def _fit(made: Plan, pace: choice.Pace, keep: Plan | None = None) -> None:
     """Choose techniques and settings anew where the user asks for an error or a time.
 
@@ -816,7 +696,7 @@ def _changed(plan: Plan, row: PlanRow, technique, settings, reason, predicted, f
         reason=reason,
         settings=settings,
         predicted=predicted,
-        effects=row.effects | _effects(plan.scene, part, technique, row.pixels, weight, settings),
+        effects=row.effects | effects_of(plan.scene, part, technique, row.pixels, weight, settings),
     )
 
 
@@ -832,63 +712,3 @@ def _options(made: Plan, row: PlanRow) -> list[choice.Option]:
         far = applicable.far_environment(*ask, settings.max_error_px or float("inf"))
         work |= {far.technique: far.work} if far is not None else {}
     return choice.options_of(work, settings, made.costs, thread_count(scene.device, settings.threads))
-
-
-def _collection(scene: Scene, part: PartRange) -> Effect:
-    seen = scene.seen_in(part)
-    if seen is None:
-        return Effect(False, "no collection named reflects: it shows everything")
-    count = int(seen.sum())
-    return Effect(True, f"its collection named reflects holds {count} of {len(seen)} triangles", {"triangles": count})
-
-
-def _effects(scene, part, technique, pixels, weight, settings) -> dict[str, Effect]:
-    traced, mapped = technique == "raytraced", technique in MAPS
-    searched = not traced and not mapped
-    no_search = "maps are looked up" if mapped else "no search"
-    visible = pixels > 0
-    material = scene.data.materials[part.material]
-    bound = f">= {settings.reflector_min_weight} (reflector_min_weight)"
-    if material.transmission > 0.0:
-        kept = f"{1.0 - material.transmission:g}, what is not let through"
-        bound = f">= {kept}, x {settings.reflector_min_weight} (reflector_min_weight)"
-    if material.mirror is not None:
-        bound = "chosen by name"
-    return {
-        "reflection": Effect(
-            visible,
-            f"mirror weight {weight:.2f} {bound}, {pixels} pixels" if visible else "not seen from the camera",
-            {"weight": weight, "pixels": pixels},
-        ),
-        "collection": _collection(scene, part),
-        "refinement": Effect(
-            visible and searched and settings.refine != "off",
-            "traced rays are exact already"
-            if traced
-            else "maps are looked up: there is no candidate to refine"
-            if mapped
-            else f"refine={settings.refine}",
-        ),
-        "grid": Effect(
-            visible and technique == "reflector_map" and (settings.grid_share > 0.0 or settings.grid_error_px > 0.0),
-            f"grid_share={settings.grid_share:g}, grid_error_px={settings.grid_error_px:g}"
-            if technique == "reflector_map"
-            else "only reflector maps are interpolated",
-        ),
-        "reuse": Effect(
-            visible and technique in REUSING and settings.reuse_px > 0.0,
-            f"reuse_px={settings.reuse_px:g}" if technique in REUSING else "no search that could be left out",
-        ),
-        "warm_start": Effect(
-            visible and searched, "from the previous frame where one is given" if searched else no_search
-        ),
-        **finish_effects(scene, part, visible, settings, technique),
-    }
-
-
-def _shadows(lights: list[LightRow], visible: bool) -> Effect:
-    """Shadows among what a mirror shows: of the lights that cast them."""
-    casting = [row.path for row in lights if row.effects["shadows"].on]
-    if not casting:
-        return Effect(False, "no light casts shadows into view (see the lights)")
-    return Effect(visible, f"cast by {', '.join(casting)}" if visible else "not seen from the camera")

@@ -32,7 +32,8 @@ from warp_reflect.pipeline import (
     one_line,
     tell_all,
 )
-from warp_reflect.planner import PlanRow, prefer_forward
+from warp_reflect.plan_rows import PlanRow
+from warp_reflect.planner import prefer_forward
 from warp_reflect.progress import Report
 from warp_reflect.scene import PartRange, Scene
 from warp_reflect.stage.write_virtual import PURPOSES, Place, VirtualLayer, VirtualSample

@@ -11,7 +11,8 @@ import pyvista as pv
 from warp_reflect.frame import Frame, reflect_scene
 from warp_reflect.images import srgb_from_linear
 from warp_reflect.layers import Camera, ReflectionLayer
-from warp_reflect.planner import Plan, PlanRow, prefer_forward
+from warp_reflect.plan_rows import PlanRow
+from warp_reflect.planner import Plan, prefer_forward
 from warp_reflect.scene import Scene
 from warp_reflect.scene_field import make_field
 from warp_reflect.settings import Status, Technique

@@ -9,7 +9,8 @@ import pyvista as pv
 
 from warp_reflect.cubemap import FACE_COUNT, face_axes
 from warp_reflect.layers import Camera, ReflectionLayer
-from warp_reflect.planner import Plan, PlanRow
+from warp_reflect.plan_rows import PlanRow
+from warp_reflect.planner import Plan
 from warp_reflect.reflector_maps import ReflectorMap
 from warp_reflect.techniques import reflector_map
 from warp_reflect.techniques.grid import UsedCells

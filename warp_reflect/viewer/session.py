@@ -19,7 +19,8 @@ from warp_reflect.frame import Frame, render_frame
 from warp_reflect.images import srgb_from_linear
 from warp_reflect.layers import Camera
 from warp_reflect.metrics import Comparison, PixelClass, compare_frames
-from warp_reflect.planner import METHODS, Plan, PlanLine, PlanRow, find_camera, make_plan, with_techniques
+from warp_reflect.plan_rows import PlanRow
+from warp_reflect.planner import METHODS, Plan, PlanLine, find_camera, make_plan, with_techniques
 from warp_reflect.scene import Scene
 from warp_reflect.settings import Settings, Status, Technique
 from warp_reflect.sweep import REFERENCE, Contender
