@@ -128,7 +128,7 @@ class Settings:
     """Texels of reference environment maps: `packed` (4 bytes) or `full` (20 bytes, single precision)."""
     rem_missing: str = "shade"
     """What no reference map sees is shaded where it is met (`shade`), or shows the map that would weigh most (`best`)."""
-    rem_blur_px: float = 64.0
+    rem_blur_px: float = 16.0
     """A reference map whose texel covers more texels of the local map than this does not count as seeing a point; 0: it does.
     [texels of a local map]"""
     rem_limit: int = 16
