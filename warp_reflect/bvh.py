@@ -50,6 +50,8 @@ OWN_FACET_REACH = wp.constant(2.0)
 RAYS_A_TRIANGLE = 0.25
 TRACE_SPLIT_MIN = 512  # rays; at 0.3 us and more a ray, half of them outweigh the hand-off to a second thread
 
+UNASKED = wp.constant(-2)  # `bvh_vector.UNASKED`
+NONE = wp.constant(int(Status.NONE))
 HIT = wp.constant(int(Status.CONVERGED))
 SKY = wp.constant(int(Status.SKY))
 STEP_LIMIT = wp.constant(int(Status.STEP_LIMIT))
@@ -196,7 +198,7 @@ def ask(mesh_id: wp.uint64, origin: wp.vec3, direction: wp.vec3) -> Met:
 def answered(known: int, triangle: int, u: float, v: float, t: float) -> Met:
     """What `bvh_vector.first_met` has left in a ray's outputs, if it was asked."""
     met = Met()
-    met.known = known
+    met.known = wp.where(triangle == UNASKED, 0, known)
     met.triangle = triangle
     met.t = t
     met.first = u
@@ -342,10 +344,12 @@ def trace_pixels_kernel(
     out_distance: wp.array(dtype=float),
     out_status: wp.array(dtype=wp.uint8),
 ):
-    """One thread per asked mirror pixel; known 1: the outputs hold what is met first."""
+    """One thread per asked mirror pixel; known 1: what `bvh_vector.first_met` has left."""
     i = first + wp.tid()
     if indexed != 0:
         i = index[i]
+    if known != 0 and int(out_status[i]) != NONE:
+        return
     met = answered(known, out_triangle[i], out_u[i], out_v[i], out_distance[i])
     hit = trace_ray_from(mesh_id, scene, point[i], direction[i], normal[i], facets[pixel[i]], body, 0, 0.0, met)
     out_triangle[i] = hit.triangle
@@ -541,8 +545,10 @@ def trace_bounced_kernel(
     out_distance: wp.array(dtype=float),
     out_status: wp.array(dtype=wp.uint8),
 ):
-    """One thread per ray; known 1: the outputs hold what is met first."""
+    """One thread per ray; known 1: what `bvh_vector.first_met` has left."""
     i = first + wp.tid()
+    if known != 0 and int(out_status[i]) != NONE:
+        return
     body = bodies[scene.triangle_patch[facet[i]]]
     met = answered(known, out_triangle[i], out_u[i], out_v[i], out_distance[i])
     hit = trace_ray_from(mesh_id, scene, point[i], direction[i], normal[i], facet[i], body, 1, 0.0, met)
@@ -746,12 +752,18 @@ def trace_pixels(
         int(index is not None),
     ]
     outputs = [layer.triangle, layer.u, layer.v, layer.distance, layer.status]
-    known = _first_met(scene.mirror_tracer(part), pixels, layer, index, threads, kernels, gbuffer.camera.size[0])
-    inputs = [*rays, known, *outputs]
-    launch.launch(trace_pixels_kernel, count, inputs, scene.device, threads, split_min=TRACE_SPLIT_MIN)
-    # The neighbours' answers are read from a copy, so that the order of threads cannot matter.
-    before = wp.clone(layer.status)
-    launch.launch(retry_pixels_kernel, count, [*rays, before, *outputs], scene.device, threads)
+    start = [gbuffer.triangle, pixels.pixel, rays[7], wp.zeros(0, dtype=OwnBody, device=scene.device)]
+    width = gbuffer.camera.size[0]
+    known, left, missed = _first_met(
+        scene, scene.mirror_tracer(part), layer, start, index, False, threads, kernels, width
+    )
+    if left:
+        inputs = [*rays, known, *outputs]
+        launch.launch(trace_pixels_kernel, count, inputs, scene.device, threads, split_min=TRACE_SPLIT_MIN)
+    if left or missed:
+        # The neighbours' answers are read from a copy, so that the order of threads cannot matter.
+        before = wp.clone(layer.status)
+        launch.launch(retry_pixels_kernel, count, [*rays, before, *outputs], scene.device, threads)
     if scene.has_hole is not None:
         _past_holes(
             scene, layer, scene.mirror_tracer(part), gbuffer.triangle, pixels.pixel, body=rays[7], threads=threads
@@ -760,26 +772,33 @@ def trace_pixels(
 
 
 def _first_met(
+    scene: Scene,
     tracer: Tracer,
-    pixels: MirrorPixels,
     layer: ReflectionLayer,
+    start: list,
     index: wp.array | None,
+    retry: bool,
     threads: int,
     kernels: str,
-    width: int = 0,
-) -> int:
-    """Leave what rays meet first in a layer's arrays, where there are packets for it: 1, else 0."""
-    if not vector.chosen(kernels, layer.triangle.device):
-        return 0
-    if not tracer.pays(pixels.count if index is None else len(index)):
-        return 0
+    width: int,
+) -> tuple[int, bool, bool]:
+    """Answer rays of a layer in packets, where there are packets for it, see `bvh_vector.first_met`.
+
+    Returns:
+        (1 if there are, else 0; whether any ray is left; whether any meets nothing).
+    """
+    pixels = layer.pixels
+    if not vector.chosen(kernels, scene.device) or not tracer.pays(pixels.count if index is None else len(index)):
+        return 0, True, True
     from warp_reflect import bvh_vector  # not compiled where it is not asked for
 
     rays = [pixels.point, pixels.normal, pixels.direction]
     if index is None and width > 0:
         index = bvh_vector.in_tiles(pixels.pixel, width, threads)
-    bvh_vector.first_met(tracer.packets, rays, index, [layer.triangle, layer.u, layer.v, layer.distance], threads)
-    return 1
+    outputs = [layer.triangle, layer.u, layer.v, layer.distance, layer.status]
+    start = [*start, scene.view.triangle_patch]
+    state = bvh_vector.first_met(tracer.packets, scene.triangle_records, rays, start, index, retry, outputs, threads)
+    return 1, bool(state & bvh_vector.LEFT), bool(state & bvh_vector.MISSED)
 
 
 def trace_transmitted(
@@ -831,12 +850,12 @@ def trace_bounced(
         kernels: `Settings.kernels`.
     """
     pixels = layer.pixels
-    inputs = [wp.uint64(scene.tracer.id), scene.view, facet, pixels.point, pixels.normal, pixels.direction, bodies]
-    inputs.append(_first_met(scene.tracer, pixels, layer, None, threads, kernels))
-    outputs = [layer.triangle, layer.u, layer.v, layer.distance, layer.status]
-    launch.launch(
-        trace_bounced_kernel, pixels.count, inputs + outputs, scene.device, threads, split_min=TRACE_SPLIT_MIN
-    )
+    start = [facet, wp.zeros(0, dtype=int, device=scene.device), OwnBody(), bodies]
+    known, left, _ = _first_met(scene, scene.tracer, layer, start, None, True, threads, kernels, 0)
+    if left:
+        inputs = [wp.uint64(scene.tracer.id), scene.view, facet, pixels.point, pixels.normal, pixels.direction]
+        inputs += [bodies, known, layer.triangle, layer.u, layer.v, layer.distance, layer.status]
+        launch.launch(trace_bounced_kernel, pixels.count, inputs, scene.device, threads, split_min=TRACE_SPLIT_MIN)
     if scene.has_hole is not None:
         _past_holes(scene, layer, scene.tracer, facet, bodies=bodies, threads=threads)
 

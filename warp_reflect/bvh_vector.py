@@ -1,21 +1,32 @@
-"""What rays meet first, for a block of them at a time: the first of the queries of `bvh.trace_ray`, in packets.
+"""What rays meet first, for a block of them at a time: `bvh.trace_ray` in packets, bit for bit.
 
-Neighbouring rays stay together for most of the way (`wide_packets.py`). What `bvh` makes of the answer, and the queries of the
-few rays that go on from there, are its own.
+Neighbouring rays stay together for most of the way (`wide_packets.py`). The few rays that meet their own facet or body first
+are left to `bvh`, with what they met.
 """
 
 from __future__ import annotations
 
+import numpy as np
 import warp as wp
 
 from warp_reflect import vector
+from warp_reflect.bvh import OwnBody
 from warp_reflect.launch import FINITE_FLAGS, launch
+from warp_reflect.settings import Status
 from warp_reflect.wide_packets import TRAVERSAL
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FINITE_FLAGS})
 
 BLOCK_SPLIT_MIN = 8  # blocks; what `bvh.TRACE_SPLIT_MIN` rays are
+LEFT, MISSED = 1, 2  # flags of a block: rays are left to the plain kernels, some meet nothing
+UNASKED = -2  # a triangle: nothing is known of what the ray meets
 TILE = 4  # pixels along a side of a packet's part of the picture: a square one is met by the fewest boxes
+
+
+_CONSTANTS = f"""
+    constexpr int NONE = {int(Status.NONE)}, CONVERGED = {int(Status.CONVERGED)}, SKY = {int(Status.SKY)};
+    constexpr int LEFT = {LEFT}, MISSED = {MISSED}, UNASKED = {UNASKED};
+"""
 
 
 @wp.func_native(
@@ -62,54 +73,172 @@ def order_kernel(first: int, pixel: wp.array(dtype=int), width: int, out_order: 
 
 @wp.func_native(
     vector.snippet(
-        TRAVERSAL
+        _CONSTANTS
+        + TRAVERSAL
         + r"""
     const int count = indexed != 0 ? index.shape[0] : point.shape[0];
     const int begin = block * BLOCK;
     const int end = begin + BLOCK < count ? begin + BLOCK : count;
+    const float* points = (const float*)point.data;
+    const float* normals = (const float*)normal.data;
+    const float* directions = (const float*)direction.data;
+    // Of a tile's row, whose four pixels follow one another: rows are read and turned.
+    const I in_row = lanes() & 3;
+    auto by_rows = [&](I own) -> bool {
+        I first;
+        EACH_LANE first[l] = own[l & ~3];
+        return !bits(own - first != in_row);
+    };
+    auto rows = [&](const float* p, I own, bool ordered) -> V {
+#if defined(__AVX512F__)
+        return vgather(p, own);
+#else
+        if (!ordered) return vgather(p, own);
+        auto four = [&](int k) -> Four { Four v; __builtin_memcpy(&v, p + k, sizeof(v)); return v; };
+        const int one = 3 * own[0], other = 3 * own[4];
+        float both[24];
+        const F a = __builtin_shufflevector(four(one), four(one + 4), 0, 1, 2, 3, 4, 5, 6, 7);
+        const F b = __builtin_shufflevector(four(one + 8), four(other), 0, 1, 2, 3, 4, 5, 6, 7);
+        const F c = __builtin_shufflevector(four(other + 4), four(other + 8), 0, 1, 2, 3, 4, 5, 6, 7);
+        store(both, a); store(both + 8, b); store(both + 16, c);
+        return vload(both, 0);
+#endif
+    };
+    // `bvh.exact_hit`, lanes of `hit`; the weights of the second and third corner in place of Warp's.
+    auto finish = [&](I hit, V o, V d, Met& met) {
+        V v0, v1, v2;
+        corners(records.data, ipick(hit, met.face, I(0)), v0, v1, v2);
+        const V a = sub(v0, o), b = sub(v1, o), c = sub(v2, o);
+        const F eu = dot(cross(sub(c, a), add(c, a)), d);
+        const F ev = dot(cross(sub(a, b), add(a, b)), d);
+        const F ew = dot(cross(sub(b, c), add(b, c)), d);
+        const F det = eu + ev + ew;
+        const F inverse = 1.0f / pick(det != 0.0f, det, F(1.0f));
+        const F u = eu * inverse, v = ev * inverse, w = ew * inverse;
+        const F t = (w * dot(a, d) + u * dot(b, d) + v * dot(c, d)) / dot(d, d);
+        const I exact = (det != 0.0f) & (fmin(fmin(u, v), w) > -0.01f);
+        met.t = pick(hit, pick(exact, fmax(t, F(0.0f)), met.t), F(0.0f));
+        const F cu = fmax(pick(exact, u, met.v), F(0.0f)), cv = fmax(pick(exact, v, 1.0f - met.u - met.v), F(0.0f));
+        const F total = cu + cv;
+        const I beyond = total > 1.0f;
+        met.u = pick(hit, pick(beyond, cu / total, cu), F(0.0f));
+        met.v = pick(hit, pick(beyond, cv / total, cv), F(0.0f));
+    };
+    int state = 0;
     for (int start = begin; start < end; start += 2 * LANES) {
-        V o[2], d[2];
+        V from[2], o[2], d[2], along[2];
         I live[2], own[2];
         F reach[2];
         Met met[2];
+        bool ordered[2];
+        I moved[2] = {I(0), I(0)};
         for (int g = 0; g < 2; ++g) {
             const I element = start + g * LANES + lanes();
             live[g] = element < end;
             own[g] = ipick(live[g], element, I(end - 1));
             if (indexed != 0) own[g] = igather(index.data, own[g]);
-            const V at = vgather((const float*)point.data, own[g]), n = vgather((const float*)normal.data, own[g]);
+            ordered[g] = by_rows(own[g]);
+            from[g] = rows(points, own[g], ordered[g]);
+            along[g] = rows(directions, own[g], ordered[g]);
             // bvh.ray_offset
-            const F offset = 16.0f * 1.1920929e-7f
-                * (__builtin_elementwise_abs(at.x) + __builtin_elementwise_abs(at.y) + __builtin_elementwise_abs(at.z));
-            o[g] = add(at, times(offset, n));
-            d[g] = flushed(vgather((const float*)direction.data, own[g]));
+            const F offset = 16.0f * 1.1920929e-7f * (__builtin_elementwise_abs(from[g].x)
+                + __builtin_elementwise_abs(from[g].y) + __builtin_elementwise_abs(from[g].z));
+            o[g] = add(from[g], times(offset, rows(normals, own[g], ordered[g])));
+            d[g] = flushed(along[g]);
             reach[g] = F(3.0e38f);
         }
-        first_met_by(live, o, d, reach, met);
-        for (int g = 0; g < 2; ++g)
-            for (unsigned left = bits(live[g]); left != 0; left &= left - 1) {
-                const int l = __builtin_ctz(left), i = own[g][l];
-                out_triangle.data[i] = met[g].face[l];
-                out_u.data[i] = met[g].u[l];
-                out_v.data[i] = met[g].v[l];
-                out_t.data[i] = met[g].t[l];
+        I missed[2] = {live[0], live[1]};
+        for (int round = 0; round < 2; ++round) {
+            Met found[2];
+            first_met_by(missed, o, d, reach, found);
+            for (int g = 0; g < 2; ++g) {
+                Met& m = met[g];
+                if (round == 0) {
+                    m = found[g];
+                } else {
+                    m.face = ipick(missed[g], found[g].face, m.face);
+                    m.t = pick(missed[g], found[g].t, m.t);
+                    m.u = pick(missed[g], found[g].u, m.u);
+                    m.v = pick(missed[g], found[g].v, m.v);
+                    moved[g] = missed[g];
+                }
+                missed[g] &= found[g].face < 0;
+                // bvh.moved_direction
+                const F step = 8.0f * 1.1920929e-7f * size(d[g]);
+                d[g] = vpick(missed[g], add(d[g], V{step, -0.625f * step, 0.375f * step}), d[g]);
             }
+            if (retry == 0 || !bits(missed[0] | missed[1])) break;
+        }
+        for (int g = 0; g < 2; ++g) {
+            if (!bits(live[g])) break;
+            const I facet = igather(facets.data, pixel.shape[0] > 0 ? igather(pixel.data, own[g]) : own[g]);
+            I first = I(body.first_triangle), length = I(body.triangle_count);
+            if (bodies.shape[0] > 0) {
+                const I patch = igather(patches.data, facet);
+                EACH_LANE {
+                    first[l] = bodies.data[patch[l]].first_triangle;
+                    length[l] = bodies.data[patch[l]].triangle_count;
+                }
+            }
+            Met& m = met[g];
+            const I hit = m.face >= 0;
+            const I left = live[g] & hit & ((m.face == facet) | ((m.face >= first) & (m.face < first + length)));
+            const F warp_t = m.t, warp_u = m.u, warp_v = m.v;
+            finish(hit & ~left, from[g], along[g], m);
+            m.face = ipick(left & moved[g], I(UNASKED), m.face);
+            m.t = pick(left, warp_t, m.t); m.u = pick(left, warp_u, m.u); m.v = pick(left, warp_v, m.v);
+            const I status = ipick(left, I(NONE), ipick(hit, I(CONVERGED), I(SKY)));
+            state |= (bits(left) != 0 ? LEFT : 0) | (bits(live[g] & ~hit) != 0 ? MISSED : 0);
+            // By memory: the compiler would store a whole vector for every lane that is taken out of it.
+            int at[LANES], face[LANES], told[LANES];
+            float t[LANES], u[LANES], v[LANES];
+            istore(at, own[g]); istore(face, m.face); istore(told, status);
+            store(t, m.t); store(u, m.u); store(v, m.v);
+            if (ordered[g] && !bits(~live[g])) {
+                for (int l = 0; l < LANES; l += 4) {
+                    __builtin_memcpy(out_triangle.data + at[l], face + l, 16);
+                    __builtin_memcpy(out_u.data + at[l], u + l, 16);
+                    __builtin_memcpy(out_v.data + at[l], v + l, 16);
+                    __builtin_memcpy(out_t.data + at[l], t + l, 16);
+                    for (int k = 0; k < 4; ++k) out_status.data[at[l] + k] = (unsigned char)told[l + k];
+                }
+            } else {
+                for (unsigned some = bits(live[g]); some != 0; some &= some - 1) {
+                    const int l = __builtin_ctz(some), i = at[l];
+                    out_triangle.data[i] = face[l];
+                    out_u.data[i] = u[l];
+                    out_v.data[i] = v[l];
+                    out_t.data[i] = t[l];
+                    out_status.data[i] = (unsigned char)told[l];
+                }
+            }
+        }
     }
+    out_state.data[block] = state;
 """
     )
 )
 def first_met_block(
     block: int,
     mesh_id: wp.uint64,
+    records: wp.array(dtype=float),
     point: wp.array(dtype=wp.vec3),
     normal: wp.array(dtype=wp.vec3),
     direction: wp.array(dtype=wp.vec3),
+    facets: wp.array(dtype=int),
+    pixel: wp.array(dtype=int),
+    body: OwnBody,
+    bodies: wp.array(dtype=OwnBody),
+    patches: wp.array(dtype=int),
     index: wp.array(dtype=int),
     indexed: int,
+    retry: int,
     out_triangle: wp.array(dtype=int),
     out_u: wp.array(dtype=float),
     out_v: wp.array(dtype=float),
     out_t: wp.array(dtype=float),
+    out_status: wp.array(dtype=wp.uint8),
+    out_state: wp.array(dtype=int),
 ): ...
 
 
@@ -117,20 +246,53 @@ def first_met_block(
 def first_met_blocks_kernel(
     first: int,
     mesh_id: wp.uint64,
+    records: wp.array(dtype=float),
+    # Rays:
     point: wp.array(dtype=wp.vec3),
     normal: wp.array(dtype=wp.vec3),
     direction: wp.array(dtype=wp.vec3),
+    # Where they start:
+    facets: wp.array(dtype=int),
+    pixel: wp.array(dtype=int),
+    body: OwnBody,
+    bodies: wp.array(dtype=OwnBody),
+    patches: wp.array(dtype=int),
+    # Which are asked:
     index: wp.array(dtype=int),
     indexed: int,
+    retry: int,
     # Outputs:
     out_triangle: wp.array(dtype=int),
     out_u: wp.array(dtype=float),
     out_v: wp.array(dtype=float),
     out_t: wp.array(dtype=float),
+    out_status: wp.array(dtype=wp.uint8),
+    out_state: wp.array(dtype=int),
 ):
-    """One thread per block of asked rays; u and v as Warp's queries name them, for the first and second corner."""
+    """One thread per block of asked rays."""
     block = first + wp.tid()
-    first_met_block(block, mesh_id, point, normal, direction, index, indexed, out_triangle, out_u, out_v, out_t)
+    first_met_block(
+        block,
+        mesh_id,
+        records,
+        point,
+        normal,
+        direction,
+        facets,
+        pixel,
+        body,
+        bodies,
+        patches,
+        index,
+        indexed,
+        retry,
+        out_triangle,
+        out_u,
+        out_v,
+        out_t,
+        out_status,
+        out_state,
+    )
 
 
 def in_tiles(pixel: wp.array, width: int, threads: int = 0) -> wp.array | None:
@@ -145,19 +307,36 @@ def in_tiles(pixel: wp.array, width: int, threads: int = 0) -> wp.array | None:
 
 
 def first_met(
-    mesh: int, rays: list[wp.array], index: wp.array | None, outputs: list[wp.array], threads: int = 0
-) -> None:
+    mesh: int,
+    records: wp.array,
+    rays: list[wp.array],
+    start: list,
+    index: wp.array | None,
+    retry: bool,
+    outputs: list[wp.array],
+    threads: int = 0,
+) -> int:
     """What rays meet first.
 
     Args:
         mesh: `bvh.Tracer.packets`.
+        records: `Scene.triangle_records`.
         rays: vec3 each: points, normals on the rays' side, unit directions.
+        start: Where they start: facets; int32, where among these that of each ray is, none: in order; the body of all of
+            them; bodies of patches, none: that body; the patches of triangles.
         index: int32, which of the rays; None: all.
-        outputs: Triangle (-1 none), u, v, t of the rays asked; what is met alone sets the last three.
+        retry: A ray that meets nothing is asked once more, turned by a few ulp.
+        outputs: Triangle, u, v, t, status of the rays asked. What meets its own facet or body first is left: status NONE, with
+            what was met (u and v as Warp's queries name them), or triangle `UNASKED`.
         threads: CPU threads; 0: one per core.
+
+    Returns:
+        `LEFT` and `MISSED`, where they hold for any ray.
     """
     device = rays[0].device
-    count = len(rays[0]) if index is None else len(index)
-    which = [wp.zeros(0, dtype=int, device=device) if index is None else index, int(index is not None)]
-    inputs = [wp.uint64(mesh), *rays, *which, *outputs]
-    launch(first_met_blocks_kernel, vector.block_count(count), inputs, device, threads, split_min=BLOCK_SPLIT_MIN)
+    blocks = vector.block_count(len(rays[0]) if index is None else len(index))
+    which = [wp.zeros(0, dtype=int, device=device) if index is None else index, int(index is not None), int(retry)]
+    state = wp.empty(blocks, dtype=int, device=device)
+    inputs = [wp.uint64(mesh), records, *rays, *start, *which, *outputs, state]
+    launch(first_met_blocks_kernel, blocks, inputs, device, threads, split_min=BLOCK_SPLIT_MIN)
+    return int(np.bitwise_or.reduce(state.numpy()))
