@@ -20,7 +20,7 @@ FILES = {
 
 # A module imports from its own floor or below. A new module belongs into this table; `x.*` is a folder.
 FLOORS = {
-    1: "settings launch vector packets wide_packets wide_tree devices optics shapes bodies topology "
+    1: "settings launch vector hits_vector packets wide_packets wide_tree devices optics shapes bodies topology "
     "cubemap quadrics quadric_roots quadric_curve quadric_fit heightfield heightfield_vector "
     "grid_rays occupancy voxels "
     "images metrics timing clipping cutouts",
@@ -29,7 +29,7 @@ FLOORS = {
     "surface_vector pictures textures holes cut_shadows "
     "normal_maps bounces direct shadow_starts shadow_neighbours shadows transmission "
     "transmission_vector waves waves_vector channels stage stage.* scene_field "
-    "baked_environments shadows_vector bvh_vector",
+    "baked_environments shadow_starts_vector shadows_vector bvh_vector",
     3: "solve solver solve_device solve_plane solve_convex solve_map solve_general solve_qim solver_gradients mirrors "
     "refraction solve_refraction solver_arrays reflector_maps techniques techniques.* finishes finishes.*",
     4: "kernels planner plan_rows detail mirrored_eyes effects lighting probe budget choice applicable calibration calibrate "

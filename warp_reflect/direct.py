@@ -69,6 +69,7 @@ class Points:
         direction: vec3 [n], unit, of the ray that sees it.
         pixel: int32 [n], which pixel of the image; length 0: all of them in order.
         width, height: Of the image. [pixels]
+        camera: Where u, v and direction have length 0: what the eye sees, by kernels that find them themselves.
     """
 
     triangle: wp.array
@@ -78,6 +79,7 @@ class Points:
     pixel: wp.array
     width: int
     height: int
+    camera: CameraView | None = None
 
 
 def prepare_direct(lights: list[LightData], origin: np.ndarray, device) -> DirectView:
@@ -313,8 +315,12 @@ def points_of(
     layer: ReflectionLayer | None = None,
     threads: int = 0,
     chosen: np.ndarray | None = None,
+    weighed: bool = True,
 ) -> Points:
-    """What a frame shows: the eye's picture, at all its pixels or at those chosen (int32), or what is seen in a mirror."""
+    """What a frame shows: the eye's picture, at all its pixels or at those chosen (int32), or what is seen in a mirror.
+
+    Not `weighed`: of the eye's picture weights and directions are left to `shadow_starts_vector`.
+    """
     device, size = scene.device, gbuffer.camera.size
     if layer is not None:
         pixels = layer.pixels
@@ -323,6 +329,10 @@ def points_of(
     if chosen is not None:
         triangle = wp.array(triangle.numpy()[chosen], dtype=int, device=device, copy=False)
         pixel = wp.array(chosen, dtype=int, device=device, copy=False)
+    if not weighed:
+        none = wp.zeros(0, dtype=float, device=device)
+        direction = wp.zeros(0, dtype=wp.vec3, device=device)
+        return Points(triangle, none, none, direction, pixel, *size, gbuffer.view)
     direction = wp.zeros(len(triangle), dtype=wp.vec3, device=device)
     u, v = (wp.zeros(len(triangle), dtype=float, device=device) for _ in range(2))
     inputs = [scene.view, gbuffer.view, triangle, pixel, direction, u, v]

@@ -69,7 +69,8 @@ def of_view(settings: Settings, device: wp.DeviceLike, casting: bool = False, mi
     if mirrors:
         asked += ["surface"]
     if casting:
-        asked += ["direct", "shadow_starts", "|wide_tree", "|shadows_vector", "-shadows/tried"]
+        asked += ["direct", "|shadow_starts_vector", "-shadow_starts/plain"]
+        asked += ["|wide_tree", "|shadows_vector", "-shadows/tried"]
     return _of(asked, vectors(settings, device))
 
 
@@ -86,7 +87,8 @@ def of_plan(plan: Plan) -> list[str]:
     seen = [row for row in plan.rows if row.pixels > 0]
     if plan.shadows is not None and plan.shadows.direct and plan.scene.triangle_count:
         cut = plan.scene.has_hole is not None
-        asked += ["direct", *(["cut_shadows"] if cut else ["shadow_starts", "|shadows_vector", "-shadows/plain"])]
+        sent = ["-direct", "|shadow_starts_vector", "-shadow_starts/plain", "|shadows_vector", "-shadows/plain"]
+        asked += ["direct", "cut_shadows"] if cut else sent
     if seen:
         asked += ["surface", "|surface_vector", "-surface/plain", "shade"]
     for row in seen:

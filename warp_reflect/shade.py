@@ -515,7 +515,9 @@ def arriving(
     areas = 0 if without_areas else len(scene.lights.direct.areas)
     if not asked and areas == 0:
         return direct, sky
-    points = points_of(scene, gbuffer, layer, threads)
+    # What rays are sent from is found in vectors, which need no weights before.
+    late = asked and shadows.direct and scene.has_hole is None and vector.chosen(kernels, scene.device)
+    points = points_of(scene, gbuffer, layer, threads, weighed=not late)
     if asked and shadows.direct:
         direct = shadowed_irradiance(scene, points, shadows, threads, normals, kernels)
     elif areas > 0:

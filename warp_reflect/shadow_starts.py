@@ -11,15 +11,16 @@ from __future__ import annotations
 import warp as wp
 
 from warp_reflect import vector
-from warp_reflect.bvh import FINITE_FLAGS, ray_offset, scene_facet_normal
+from warp_reflect.bvh import ray_offset, scene_facet_normal
 from warp_reflect.direct import DirectView, Points, area_irradiance
-from warp_reflect.launch import launch
+from warp_reflect.launch import launch, module_part
 from warp_reflect.scene import SHAPE_QUADRIC, Scene, SceneView
 from warp_reflect.surface import hit_normal, shown_normal
 
-wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FINITE_FLAGS})
+wp.set_module_options({"enable_backward": False})
+PLAIN = module_part(__name__, "plain")  # what vector kernels do elsewhere
 
-ROWS = 11  # of `Starts.rows`: point, normal, facet's normal, shift of the samples
+ROWS = wp.constant(11)  # of `Starts.rows`: point, normal, facet's normal, shift of the samples
 LEAST_SQUARE = wp.constant(1.0e-30)  # keeps quotients finite
 # 1 / g and 1 / g^2 of g^3 = g + 1.
 R2_X = wp.constant(0.7548776662466927)
@@ -126,7 +127,7 @@ class Starts:
     unshadowed: wp.array2d(dtype=float)  # by each shape, 0 where nothing is seen
 
 
-@wp.kernel
+@wp.kernel(module=PLAIN)
 def starts_kernel(
     first: int,
     scene: SceneView,
@@ -170,7 +171,13 @@ def row_vector(rows: wp.array2d(dtype=float), row: int, i: int) -> wp.vec3:
 
 
 def starts_of(
-    scene: Scene, points: Points, normals: wp.array | None, area_count: int, threads: int = 0, numbered: bool = False
+    scene: Scene,
+    points: Points,
+    normals: wp.array | None,
+    area_count: int,
+    threads: int = 0,
+    numbered: bool = False,
+    kernels: str = "auto",
 ) -> Starts:
     """Where the shadow rays of points start.
 
@@ -181,6 +188,7 @@ def starts_of(
         area_count: Shapes whose unshadowed irradiance is wanted: all or none.
         threads: CPU threads; 0: one per core.
         numbered: Samples are shifted by the points' numbers, as for points of no image.
+        kernels: `Settings.kernels`.
     """
     device, count = scene.device, len(points.triangle)
     if normals is None:
@@ -189,6 +197,12 @@ def starts_of(
     padded = vector.BLOCK * vector.block_count(count)
     starts.rows = wp.empty((ROWS, padded), dtype=float, device=device)
     starts.unshadowed = wp.empty((area_count, padded), dtype=float, device=device)
-    at = [points.triangle, points.u, points.v, points.direction, normals, points.pixel, 0 if numbered else points.width]
+    width = 0 if numbered else points.width
+    if vector.chosen(kernels, device):
+        from warp_reflect import shadow_starts_vector  # which fills this module's rows
+
+        shadow_starts_vector.starts_of(scene, points, normals, starts, width, threads)
+        return starts
+    at = [points.triangle, points.u, points.v, points.direction, normals, points.pixel, width]
     launch(starts_kernel, count, [scene.view, scene.lights.direct, *at, starts], device, threads)
     return starts

@@ -453,7 +453,7 @@ def shadowed_irradiance(
     if any(cast.areas) and len(points.pixel):
         index = wp.full(points.width * points.height, -1, dtype=int, device=device)
         launch.launch(image_index_kernel, count, [points.pixel, index], device, threads)
-    starts = starts_of(scene, points, normals, len(areas), threads)
+    starts = starts_of(scene, points, normals, len(areas), threads, kernels=kernels)
     around = neighbours_of(points, index, len(areas) if any(cast.areas) else 0, cast.shared)
     samples = first_count(cast.samples), shared_count(cast.samples) if cast.shared else 0, cast.samples
     send = _irradiance
@@ -509,7 +509,7 @@ def sky_share(
         at = [*_arrays(points, normals, device), points.pixel, points.width]
         cut_shadows.cut_sky_share([mesh, scene.view, *at, samples], result, threads)
         return result
-    starts = starts_of(scene, points, normals, 0, threads)
+    starts = starts_of(scene, points, normals, 0, threads, kernels=kernels)
     if vector.chosen(kernels, device):
         from warp_reflect import shadows_vector
 
@@ -541,7 +541,7 @@ def light_shares(
     mesh, direct = wp.uint64(scene.shadow_tracer.id), scene.lights.direct
     lights = len(direct.distant) + len(direct.areas)
     share = wp.zeros(count * lights, dtype=float, device=device)
-    starts = starts_of(scene, points, None, len(direct.areas), threads, numbered=True)
+    starts = starts_of(scene, points, None, len(direct.areas), threads, True, kernels)
     if vector.chosen(kernels, device):
         from warp_reflect import shadows_vector
 

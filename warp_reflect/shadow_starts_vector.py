@@ -1,0 +1,265 @@
+"""`shadow_starts.starts_kernel` for a block of points at a time: the same formulas in the same order, the same bits.
+
+What the eye sees needs no pass of its own before: its rays and the weights of what they meet (`direct.eye_weights_kernel`)
+are found on the way. Shapes that are no spheres are left to the plain function.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from warp_reflect import vector
+from warp_reflect.bvh import FLOAT_EPS, OFFSET_ULPS
+from warp_reflect.direct import SPHERE, DirectView, Points, area_irradiance
+from warp_reflect.hits_vector import HITS
+from warp_reflect.launch import launch, module_part
+from warp_reflect.layers import CameraView
+from warp_reflect.scene import SHAPE_QUADRIC, Scene, SceneView
+from warp_reflect.shadow_starts import ROWS, Starts, row_vector
+
+wp.set_module_options({"enable_backward": False})
+FLAT = module_part(__name__, "flat")
+
+
+@wp.func_native(
+    vector.snippet(
+        HITS
+        + r"""
+    const int count = triangle.shape[0];
+    const int begin = block * BLOCK;
+    const int end = begin + BLOCK < count ? begin + BLOCK : count;
+    const bool parallel = camera.orthographic != 0;
+    const int image_width = of_eye != 0 ? camera.width : width;
+    const V eye = spread(camera.eye);
+    const int* normal_index = (const int*)scene.normal_index.data;
+    float* rows = out_rows.data;
+    const int stride = out_rows.shape[1];
+    const int area_count = lights.areas.shape[0] < out_unshadowed.shape[0] ? lights.areas.shape[0] : out_unshadowed.shape[0];
+    // shadow_starts.gradient_noise
+    auto below = [](F a) -> F { return a - __builtin_elementwise_floor(a); };
+    auto noise = [&](F x, F y) -> F { return below(52.9829189f * below(0.06711056f * x + 0.00583715f * y)); };
+    auto offset = [&](V a) -> F {
+        return offset_share
+            * (__builtin_elementwise_abs(a.x) + __builtin_elementwise_abs(a.y) + __builtin_elementwise_abs(a.z));
+    };
+    for (int start = begin; start < end; start += LANES) {
+        const I element = start + lanes();
+        const I own = ipick(element < end, element, I(end - 1));
+        const I known = igather(triangle.data, own);
+        const I seen = known >= 0;
+        auto keep = [&](int row, F value) { store(rows + row * stride + start, pick(seen, value, F(0.0f))); };
+        if (!bits(seen)) {
+            for (int row = 0; row < out_rows.shape[0]; ++row) store(rows + row * stride + start, F(0.0f));
+            for (int k = 0; k < area_count; ++k) store(out_unshadowed.data + k * stride + start, F(0.0f));
+            continue;
+        }
+        const I tri = ipick(seen, known, I(0));
+        const I number = pixel.shape[0] > 0 ? igather(pixel.data, own) : own;
+        V p0, p1, p2, way;
+        F u, v;
+        corners(records.data, tri, p0, p1, p2);
+        F column, line;
+        if (image_width > 0) {
+            const I row = number / image_width;
+            column = __builtin_convertvector(number - row * image_width, F);
+            line = __builtin_convertvector(row, F);
+        }
+        if (of_eye != 0) {
+            // direct.eye_weights_kernel
+            const V plane = add(add(spread(camera.ray_corner), times(column + 0.5f, spread(camera.ray_dx))),
+                times(line + 0.5f, spread(camera.ray_dy)));
+            const V ray = parallel ? spread(camera.forward) : plane;
+            V a = sub(p0, eye), b = sub(p1, eye), c = sub(p2, eye);
+            if (parallel) { a = sub(a, plane); b = sub(b, plane); c = sub(c, plane); }
+            const F eu = dot(cross(sub(c, a), add(c, a)), ray);
+            const F ev = dot(cross(sub(a, b), add(a, b)), ray);
+            const F ew = dot(cross(sub(b, c), add(b, c)), ray);
+            const F det = eu + ev + ew;
+            const F inv = 1.0f / det;
+            const F cu = pick(det != 0.0f, fmax(eu * inv, F(0.0f)), F(0.0f));
+            const F cv = pick(det != 0.0f, fmax(ev * inv, F(0.0f)), F(0.0f));
+            const F total = cu + cv;
+            u = pick(total > 1.0f, cu / total, cu);
+            v = pick(total > 1.0f, cv / total, cv);
+            way = unit(ray);
+        } else {
+            u = gather(weight_u.data, own);
+            v = gather(weight_v.data, own);
+            way = vgather((const float*)direction.data, own);
+        }
+        // shadow_starts.ray_start
+        const F w = 1.0f - u - v;
+        const V at = add(add(times(w, p0), times(u, p1)), times(v, p2));
+        const V facet = facet_normal(p0, p1, p2);
+        V n = facet, p = at;
+        const I first_normal = igather(normal_index, 3 * tri);
+        const I smooth = first_normal >= 0;
+        const I patch = igather(scene.triangle_patch.data, tri);
+        const bool alone = !bits(patch != patch[0]);
+        I shape;
+        if (alone) shape = I(scene.patches.data[patch[0]].shape);
+        else EACH_LANE shape[l] = scene.patches.data[patch[l]].shape;
+        const I quadric = (shape == shape_quadric) & ~smooth;
+        V n0 = same(0.0f), n1 = n0, n2 = n0;
+        if (bits(seen & smooth)) {
+            const float* all = (const float*)scene.normals.data;
+            n0 = vgather(all, ipick(smooth, first_normal, I(0)));
+            n1 = vgather(all, ipick(smooth, igather(normal_index, 3 * tri + 1), I(0)));
+            n2 = vgather(all, ipick(smooth, igather(normal_index, 3 * tri + 2), I(0)));
+            const V mixed = add(add(times(w, n0), times(u, n1)), times(v, n2));
+            const V kept = vpick(dot(mixed, mixed) < 0.01f, V{F(0.0f), F(0.0f), F(1.0f)}, unit(mixed));
+            n = vpick(smooth, kept, n);
+        }
+        Quadric of;
+        V q;
+        if (bits(seen & quadric)) {
+            of = quadric_of(patch, alone);
+            q = in_quadric(of, at);
+            n = vpick(quadric, unit(from_quadric(of, V{q.x, q.y, of.a * q.z + 0.5f * of.b})), n);
+        }
+        const F turned = pick(dot(n, way) > 0.0f, F(-1.0f), F(1.0f));
+        const V side = times(pick(dot(facet, n) < 0.0f, -turned, turned), facet);
+        if (bits(seen & smooth)) {
+            auto above_tangent = [&](V from, V corner, V normal) -> V {
+                return times(fmax(dot(sub(corner, from), normal), F(0.0f)), normal);
+            };
+            V raised = add(p, times(w, above_tangent(p, p0, times(turned, n0))));
+            raised = add(raised, times(u, above_tangent(raised, p1, times(turned, n1))));
+            raised = add(raised, times(v, above_tangent(raised, p2, times(turned, n2))));
+            p = vpick(smooth, raised, p);
+        }
+        if (bits(seen & quadric)) {
+            const F f = q.x * q.x + q.y * q.y + (of.a * q.z + of.b) * q.z - of.c;
+            const V gradient = from_quadric(of, V{2.0f * q.x, 2.0f * q.y, 2.0f * of.a * q.z + of.b});
+            const V step = times(-f / fmax(dot(gradient, gradient), F(1.0e-30f)), gradient);
+            p = vpick(quadric & (dot(step, side) > 0.0f), add(p, step), p);
+        }
+        if (normals.shape[0] > 0) {
+            const V mapped = vgather((const float*)normals.data, own);
+            n = vpick(dot(mapped, mapped) > 0.0f, mapped, n);
+        }
+        n = vpick(dot(n, way) > 0.0f, times(F(-1.0f), n), n);
+        p = add(p, times(fmax(offset(p0), fmax(offset(p1), offset(p2))), side));
+        keep(0, p.x); keep(1, p.y); keep(2, p.z);
+        keep(3, n.x); keep(4, n.y); keep(5, n.z);
+        keep(6, side.x); keep(7, side.y); keep(8, side.z);
+        if (width > 0) {
+            keep(9, noise(column, line));
+            keep(10, noise(line + 113.0f, column + 71.0f));
+        } else {
+            const F k = __builtin_convertvector(own, F);
+            keep(9, below(0.5f + 0.7548776662466927f * k + 0.0f));
+            keep(10, below(0.5f + 0.5698402909980532f * k + 0.0f));
+        }
+        if (out_rows.shape[0] > 11) { keep(11, at.x); keep(12, at.y); keep(13, at.z); }
+        for (int k = 0; k < area_count; ++k) {
+            const auto& area = lights.areas.data[k];
+            F arrives = F(0.0f);
+            if (area.kind == sphere) arrives = pick(seen, sphere_irradiance(seen, area, at, n), F(0.0f));
+            store(out_unshadowed.data + k * stride + start, arrives);
+        }
+    }
+""",
+        exact=True,
+    )
+)
+def start_block(
+    block: int,
+    of_eye: int,
+    scene: SceneView,
+    records: wp.array(dtype=float),
+    camera: CameraView,
+    lights: DirectView,
+    triangle: wp.array(dtype=int),
+    weight_u: wp.array(dtype=float),
+    weight_v: wp.array(dtype=float),
+    direction: wp.array(dtype=wp.vec3),
+    normals: wp.array(dtype=wp.vec3),
+    pixel: wp.array(dtype=int),
+    width: int,
+    shape_quadric: int,
+    sphere: int,
+    offset_share: float,
+    out_rows: wp.array2d(dtype=float),
+    out_unshadowed: wp.array2d(dtype=float),
+): ...
+
+
+@wp.kernel
+def starts_blocks_kernel(
+    first: int,
+    of_eye: int,
+    scene: SceneView,
+    records: wp.array(dtype=float),
+    camera: CameraView,
+    lights: DirectView,
+    triangle: wp.array(dtype=int),
+    weight_u: wp.array(dtype=float),
+    weight_v: wp.array(dtype=float),
+    direction: wp.array(dtype=wp.vec3),
+    normals: wp.array(dtype=wp.vec3),
+    pixel: wp.array(dtype=int),
+    width: int,
+    # Outputs:
+    out_rows: wp.array2d(dtype=float),
+    out_unshadowed: wp.array2d(dtype=float),
+):
+    """One thread per block of points; those of the eye have weights and rays of length 0."""
+    start_block(
+        first + wp.tid(),
+        of_eye,
+        scene,
+        records,
+        camera,
+        lights,
+        triangle,
+        weight_u,
+        weight_v,
+        direction,
+        normals,
+        pixel,
+        width,
+        SHAPE_QUADRIC,
+        SPHERE,
+        OFFSET_ULPS * FLOAT_EPS,
+        out_rows,
+        out_unshadowed,
+    )
+
+
+@wp.kernel(module=FLAT)
+def flat_irradiance_kernel(
+    first: int,
+    lights: DirectView,
+    triangle: wp.array(dtype=int),
+    rows: wp.array2d(dtype=float),
+    # Outputs:
+    out_unshadowed: wp.array2d(dtype=float),
+):
+    """One thread per point: what shapes that are no spheres bring."""
+    i = first + wp.tid()
+    if triangle[i] < 0:
+        return
+    p = row_vector(rows, ROWS, i)
+    n = row_vector(rows, 3, i)
+    for k in range(lights.areas.shape[0]):
+        if lights.areas[k].kind != SPHERE:
+            out_unshadowed[k, i] = area_irradiance(lights.areas[k], p, n)
+
+
+def starts_of(scene: Scene, points: Points, normals: wp.array, starts: Starts, width: int, threads: int) -> None:
+    """What `shadow_starts.starts_kernel` does; see `shadow_starts.starts_of`."""
+    device, count = scene.device, len(points.triangle)
+    lights, rows, flat = scene.lights.direct, starts.rows, False
+    if len(starts.unshadowed):
+        flat = bool((lights.areas.numpy()["kind"] != SPHERE).any())
+    if flat:
+        rows = wp.empty((ROWS + 3, rows.shape[1]), dtype=float, device=device)
+        starts.rows = rows
+    camera = CameraView() if points.camera is None else points.camera
+    at = [points.triangle, points.u, points.v, points.direction, normals, points.pixel, width]
+    inputs = [int(points.camera is not None), scene.view, scene.triangle_records, camera, lights, *at]
+    vector.launch_blocks(starts_blocks_kernel, count, [*inputs, rows, starts.unshadowed], device, threads)
+    if flat:
+        inputs = [lights, points.triangle, rows, starts.unshadowed]
+        launch(flat_irradiance_kernel, count, inputs, device, threads)
