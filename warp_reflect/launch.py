@@ -36,6 +36,7 @@ FINITE_FLAGS = (
 
 
 _recordings: list[list[tuple[str, int]]] = []
+_as_device: list[bool] = []
 _loaded: dict[tuple, Future] = {}
 _loading = [0.0]
 
@@ -67,9 +68,28 @@ def _pool(thread_count: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(thread_count, thread_name_prefix="warp_reflect")
 
 
+def stays(device) -> bool:
+    """Whether numbers that only decide how much is launched stay on a device: on CUDA, where reading one waits for all work.
+
+    A launch there goes over all that might be asked for, and its threads look at the number; on the CPU a number is at hand,
+    and threads that find nothing to do cost as much as others.
+    """
+    return bool(_as_device) or wp.get_device(device).is_cuda
+
+
+@contextmanager
+def as_device() -> Iterator[None]:
+    """In the context a CPU goes a CUDA device's way (`stays`), for tests and tools of plain kernels."""
+    _as_device.append(True)
+    try:
+        yield
+    finally:
+        _as_device.pop()
+
+
 def thread_count(device, threads: int = 0) -> int:
     """Slices a launch is cut into: 1 on CUDA, else `threads`, or one per available core if 0."""
-    if wp.get_device(device).is_cuda:
+    if stays(device):
         return 1
     if threads > 0:
         return threads

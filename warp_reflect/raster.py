@@ -19,7 +19,7 @@ import numpy as np
 import warp as wp
 
 from warp_reflect import vector
-from warp_reflect.launch import launch, launch_bands, module_part, slice_length
+from warp_reflect.launch import launch, launch_bands, module_part, slice_length, stays
 from warp_reflect.layers import Camera, CameraView, GBuffer, MirrorPixels, project
 from warp_reflect.scene import Scene
 from warp_reflect.shapes import unit
@@ -523,7 +523,7 @@ def rasterise(
     plane_triangles: wp.array | None = None,
     threads: int = 0,
     kernels: str = "auto",
-) -> int:
+) -> wp.array:
     """Draw triangles into a target; repeated calls accumulate.
 
     Args:
@@ -538,12 +538,11 @@ def rasterise(
         kernels: `Settings.kernels`.
 
     Returns:
-        Triangles that survived the culling (0 on CUDA, where the count stays on the device).
+        int: triangles that survived the culling, in parts to be added up.
     """
-    count = len(triangles)
+    count, device = len(triangles), target.key.device
     if count == 0 or len(target.key) == 0:
-        return 0
-    device = target.key.device
+        return wp.zeros(1, dtype=int, device=device)
     step = slice_length(count, device, threads)
     slice_count = -(-count // step)
     survivors = wp.empty(count, dtype=int, device=device)
@@ -555,9 +554,9 @@ def rasterise(
         points = wp.empty(0, dtype=wp.vec3, device=device)
     inputs = [target.view, screen, triangles, ids, id_offset, step, survivors, survivor_count]
     inputs += [points, triangles if plane_triangles is None else plane_triangles]
-    if device.is_cuda:
+    if stays(device):
         launch_bands(draw_kernel, [(0, count)], [(target.box[1], target.box[3])], inputs, device)
-        return 0
+        return survivor_count
     counts = survivor_count.numpy()
     ranges = [(k * step, int(n)) for k, n in enumerate(counts) if n > 0]
     bands = row_bands(target.box[1], target.box[3], slice_count)
@@ -569,7 +568,7 @@ def rasterise(
         # Every slice but the last, which is the only one where there is one, is a multiple of the block.
         ranges = [(begin // vector.BLOCK, vector.block_count(n)) for begin, n in ranges]
     launch_bands(kernel, ranges, bands, inputs, device)
-    return int(counts.sum())
+    return survivor_count
 
 
 def row_bands(first: int, end: int, count: int) -> list[tuple[int, int]]:

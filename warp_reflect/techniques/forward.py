@@ -261,6 +261,7 @@ def reflect(
             threads=settings.threads,
             kernels=settings.kernels,
         )
+        drawn = int(drawn.numpy().sum())
         straddling, failed = _draw_straddling(scene, mesh, target, frame, vertices, solve_boundary, gbuffer, settings)
         clipped = 0 if straddling is None else len(straddling.boundary) // 2
         layer.virtual = [Drawn(pixels, mesh, vertices.screen, straddling)]

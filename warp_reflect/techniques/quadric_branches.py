@@ -442,7 +442,7 @@ def reflect_branches(
         drawn = offset = 0
         doubt = np.zeros((target.box[3] - target.box[1] + 1, target.box[2] - target.box[0] + 1), np.int64)
         for k, (mesh, vertices) in enumerate(branches):
-            drawn += raster.rasterise(
+            survivors = raster.rasterise(
                 target,
                 vertices.screen,
                 mesh.triangles,
@@ -451,6 +451,7 @@ def reflect_branches(
                 threads=settings.threads,
                 kernels=settings.kernels,
             )
+            drawn += int(survivors.numpy().sum())
             offset += len(mesh.triangles)
             solved = vertices.status.numpy() == int(Status.CONVERGED)
             _add_doubt(doubt, mesh, vertices, solved, k, solve, unit_per_scene, camera, target.box)

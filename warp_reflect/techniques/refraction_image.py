@@ -265,7 +265,7 @@ def follow(
         scene, gbuffer, layer.pixels, target, mesh, layer, none, settings, trust_sky=True, wary=False
     )
     bvh.trace_transmitted(scene, layer, facet, inside, threads, doubtful)
-    add_statistics(layer.statistics, {"drawn": drawn, "vertices": mesh.vertex_count})
+    add_statistics(layer.statistics, {"drawn": int(drawn.numpy().sum()), "vertices": mesh.vertex_count})
 
 
 def _cut_where_bent(scene: Scene, found: Under, screen: wp.array, seen_at, box, settings: Settings):
