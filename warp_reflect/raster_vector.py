@@ -1,12 +1,13 @@
 """`raster.draw_kernel` with triangles and pixels side by side: the same picture, bit for bit.
 
-Triangles are set up in vectors, those within a box of 64 pixels are scanned row by row, and what several of them cover is
-gathered in one list: its vectors are full however few pixels a triangle has, and what a fragment needs of memory has been
-asked for by the time it is worked on. Larger triangles are drawn one at a time with pixels of a row side by side; what has to
-be clipped, by the plain kernel's functions.
+Triangles are set up in vectors, and those within a box of 64 pixels are scanned row by row. In the eye view, whose fragments
+need no memory but their own keys, pixels that lie side by side are drawn at once. Where rays tell the depth, what several
+triangles cover is gathered in one list: its vectors are full however few pixels a triangle has, and what a fragment needs of
+memory has been asked for by the time it is worked on. Larger triangles are drawn one at a time with pixels of a row side by
+side; what has to be clipped, by the plain kernel's functions.
 
 Edge functions of a triangle within a box of 64 pixels are exact in 32 bits (products below 2^29, sums of two below 2^30, and a
-vector reaches at most 16 pixels past the box); of larger ones in float64, whose 53 bits hold everything below 2^46.
+vector reaches at most 15 pixels past the box); of larger ones in float64, whose 53 bits hold everything below 2^46.
 """
 
 from __future__ import annotations
@@ -95,9 +96,38 @@ _TARGET = r"""
         return bits(mask);
 #endif
     };
+    // LANES keys of a row as their halves, without a shuffle across 128 bits: lane l has the key `place(l)`.
+    auto place = [](int l) -> int { return (l & 1) + ((l >> 2) << 1) + ((l & 2) ? LANES / 2 : 0); };
+    I places;
+    EACH_LANE places[l] = place(l);
+#if defined(__AVX512F__)
+#define EVEN 0, 2, 16, 18, 4, 6, 20, 22, 8, 10, 24, 26, 12, 14, 28, 30
+#define ODD 1, 3, 17, 19, 5, 7, 21, 23, 9, 11, 25, 27, 13, 15, 29, 31
+#define FRONT 0, 16, 1, 17, 4, 20, 5, 21, 8, 24, 9, 25, 12, 28, 13, 29
+#define BACK 2, 18, 3, 19, 6, 22, 7, 23, 10, 26, 11, 27, 14, 30, 15, 31
+#else
+#define EVEN 0, 2, 8, 10, 4, 6, 12, 14
+#define ODD 1, 3, 9, 11, 5, 7, 13, 15
+#define FRONT 0, 8, 1, 9, 4, 12, 5, 13
+#define BACK 2, 10, 3, 11, 6, 14, 7, 15
+#endif
+    auto split = [](const unsigned long long* p, U& low, U& high) {
+        U a, b;
+        __builtin_memcpy(&a, p, sizeof(a));
+        __builtin_memcpy(&b, p + LANES / 2, sizeof(b));
+        low = __builtin_shufflevector(a, b, EVEN);
+        high = __builtin_shufflevector(a, b, ODD);
+    };
+    auto join = [](unsigned long long* p, U low, U high) {
+        const U a = __builtin_shufflevector(low, high, FRONT), b = __builtin_shufflevector(low, high, BACK);
+        __builtin_memcpy(p, &a, sizeof(a));
+        __builtin_memcpy(p + LANES / 2, &b, sizeof(b));
+    };
     auto least = [](I p, I q) -> I { return p < q ? p : q; };
     auto most = [](I p, I q) -> I { return p > q ? p : q; };
     auto apart = [](V a, F s) -> V { return V{a.x / s, a.y / s, a.z / s}; };
+    // Without rays a fragment needs no memory but its key: rows of keys are worked on as they lie.
+    const bool in_rows = !rays && width >= LANES;
     const int* corner_of = (const int*)triangles.data;
     const int* plane_corner_of = (const int*)plane_triangles.data;
     const int* numbers = survivors.data + begin;
@@ -191,7 +221,7 @@ _TARGET = r"""
         const I px = ipick(drawn, left * 256 + 128, I(0)), py = ipick(drawn, top * 256 + 128, I(0));
         const F inv_area = 1.0f / __builtin_convertvector(area, F);
         // Of every triangle: edges at the first pixel, the largest that is outside, steps, and what is left of it.
-        enum { EA, EB, EC, OUT_A, OUT_B, OUT_C, DXA, DXB, DXC, DYA, DYB, DYC, COLUMNS, ROWS, CELL, FIELDS };
+        enum { EA, EB, EC, OUT_A, OUT_B, OUT_C, DXA, DXB, DXC, DYA, DYB, DYC, COLUMN, COLUMNS, TOP, ROWS, CELL, FIELDS };
         int field[FIELDS][LANES];
         istore(field[EA], dxa * (py - yb) - dya * (px - xb));
         istore(field[EB], dxb * (py - yc) - dyb * (px - xc));
@@ -205,7 +235,9 @@ _TARGET = r"""
         istore(field[DYA], dya * 256);
         istore(field[DYB], dyb * 256);
         istore(field[DYC], dyc * 256);
+        istore(field[COLUMN], left - target.x0);
         istore(field[COLUMNS], right - left);
+        istore(field[TOP], top);
         istore(field[ROWS], bottom - top);
         istore(field[CELL], (top - target.y0) * width + left - target.x0);
         float keys_a[LANES], keys_b[LANES], keys_c[LANES], inverse[LANES];
@@ -233,6 +265,44 @@ _TARGET = r"""
                 to[0] = plane.x[l]; to[1] = plane.y[l]; to[2] = plane.z[l]; to[3] = offset[l];
             }
         }
+        for (unsigned left_over = in_rows ? bits(drawn) : 0; left_over != 0; left_over &= left_over - 1) {
+            const int l = __builtin_ctz(left_over);
+            const I step_a = I(field[DYA][l]), step_b = I(field[DYB][l]), step_c = I(field[DYC][l]);
+            const I row_a = I(field[DXA][l]), row_b = I(field[DXB][l]), row_c = I(field[DXC][l]);
+            const I bias_a = -1 - I(field[OUT_A][l]), bias_b = -1 - I(field[OUT_B][l]), bias_c = -1 - I(field[OUT_C][l]);
+            const F key_a = F(keys_a[l]), key_b = F(keys_b[l]), key_c = F(keys_c[l]), inv = F(inverse[l]);
+            const U low = U((unsigned)low_of[start + l]);
+            const int x_first = field[COLUMN][l], x_last = x_first + field[COLUMNS][l], rows = field[ROWS][l];
+            // From multiples of LANES on: what a triangle writes and the next one reads are the same words, which are
+            // handed on without waiting for memory. The last vector of a row ends with it.
+            for (int x = x_first & -LANES; x <= x_last; x += LANES) {
+                const int x_begin = x + LANES <= width ? x : width - LANES;
+                const I column = x_begin - x_first + places;
+                I ea = field[EA][l] + bias_a - column * step_a, eb = field[EB][l] + bias_b - column * step_b;
+                I ec = field[EC][l] + bias_c - column * step_c;
+                unsigned long long* row = keys + field[CELL][l] - x_first + x_begin;
+                for (int y = 0; y <= rows; ++y, row += width, ea += row_a, eb += row_b, ec += row_c) {
+                    I inside = (ea | eb | ec) >= 0;
+                    if (!marks(inside)) continue;
+                    const F depth = (__builtin_convertvector(ea - bias_a, F) * key_a
+                        + __builtin_convertvector(eb - bias_b, F) * key_b
+                        + __builtin_convertvector(ec - bias_c, F) * key_c) * inv;
+                    inside &= depth > key_min;
+                    if (masked) {
+                        const int* mask = target.mask.data
+                            + (field[TOP][l] + y) * target.mask_width + target.x0 + x_begin;
+                        inside &= igather(mask, places) == target.mask_value;
+                    }
+                    U low_now, high_now;
+                    split(row, low_now, high_now);
+                    const F now = __builtin_bit_cast(F, high_now);
+                    inside &= (depth > now) | ((depth == now) & (low > low_now));
+                    if (!marks(inside)) continue;
+                    join(row, inside ? low : low_now, inside ? __builtin_bit_cast(U, depth) : high_now);
+                }
+            }
+        }
+        if (in_rows) continue;
         for (unsigned left_over = bits(drawn); left_over != 0; left_over &= left_over - 1) {
             const int l = __builtin_ctz(left_over);
             const int owner = start + l, columns = field[COLUMNS][l], rows = field[ROWS][l];
