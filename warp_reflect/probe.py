@@ -40,8 +40,7 @@ class EyeView:
         found = {part: self.pixels[number].count for number, part in self.parts.items()}
         others = [part for part in parts if part not in found]
         if others:
-            seen = surface.seen_parts(scene, self.gbuffer, others)
-            found |= {part: len(seen.get(part, ())) for part in others}
+            found |= surface.seen_parts(scene, self.gbuffer, others)
         return found
 
 

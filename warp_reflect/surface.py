@@ -6,7 +6,7 @@ normal, or for a gprim the analytic surface behind the facet, met by the eye ray
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 
 import numpy as np
 import warp as wp
@@ -27,6 +27,9 @@ from warp_reflect.shapes import clamp_weights, facet_normal, intersect_triangle,
 wp.set_module_options({"enable_backward": False})
 PLAIN = launch.module_part(__name__, "plain")  # what vector kernels do elsewhere
 CHANNELS = launch.module_part(__name__, "channels")
+SORTED = launch.module_part(__name__, "sorted")
+
+Box = tuple[int, int, int, int]  # x0, y0, x1, y1, half-open [pixels]
 
 # An interpolated normal shorter than this has lost its direction (corners apart); the facet's is used.
 LEAST_NORMAL = wp.constant(0.1)
@@ -304,46 +307,54 @@ def mirror_pixels(
         (`MirrorPixels` per id, of length 0 where a reflector is not seen; reflector id per pixel, int32
         [height * width], 0 none).
     """
-    device = scene.device
     width, height = gbuffer.camera.size
     if not parts:
-        return {}, wp.zeros(width * height, dtype=int, device=device)
-    patch_reflector = np.zeros(max(len(scene.patch_shapes), 1), np.int32)
-    for reflector, part in parts.items():
-        patch_reflector[scene.parts[part].patches] = reflector
-    reflector_id = wp.empty(width * height, dtype=int, device=device)
-    launch.launch(
-        reflector_id_kernel,
-        width * height,
-        [
-            gbuffer.triangle,
-            scene.view.triangle_patch,
-            wp.array(patch_reflector, dtype=int, device=device),
-            reflector_id,
-        ],
-        device,
-        threads,
-    )
-    found = _pixels_by_reflector(reflector_id.numpy(), parts)
-    result = {}
-    for reflector in parts:
-        result[reflector] = _met(scene, gbuffer, reflector, found[reflector], threads, kernels)
-    return result, reflector_id
+        return {}, wp.zeros(width * height, dtype=int, device=scene.device)
+    found, reflector_id = _pixels_of(scene, gbuffer, parts, threads)
+    return {id: _met(scene, gbuffer, id, *found[id], threads, kernels) for id in parts}, reflector_id
 
 
-def _met(scene: Scene, gbuffer: GBuffer, reflector: int, pixel: np.ndarray, threads: int, kernels: str) -> MirrorPixels:
+def _pixels_of(
+    scene: Scene, gbuffer: GBuffer, parts: Mapping[int, int], threads: int
+) -> tuple[dict[int, tuple[wp.array, Box]], wp.array]:
+    """(by id: the ascending pixels that show a part, and their bounds; id per pixel, 0 where there is none of the parts)."""
+    width, height = gbuffer.camera.size
+    ids = wp.empty(width * height, dtype=int, device=scene.device)
+    patches = [gbuffer.triangle, scene.view.triangle_patch, _id_of_patch(scene, parts)]
+    launch.launch(reflector_id_kernel, width * height, [*patches, ids], scene.device, threads)
+    if launch.stays(scene.device):
+        return _sorted_by_id(ids, parts, width), ids
+    found = _pixels_by_id(ids.numpy(), parts)
+    numbers = {id: wp.array(pixel, dtype=int, device=scene.device) for id, pixel in found.items()}
+    return {id: (numbers[id], pixel_bounds(pixel, width)) for id, pixel in found.items()}, ids
+
+
+def _id_of_patch(scene: Scene, parts: Mapping[int, int]) -> wp.array:
+    """int32 [patches], 0 of those of no such part; the last that were asked for are kept with the scene."""
+    known = scene.facts.get(("ids of patches", None))
+    if known is None or known[0] != parts:
+        ids = np.zeros(max(len(scene.patch_shapes), 1), np.int32)
+        for id, part in parts.items():
+            ids[scene.parts[part].patches] = id
+        known = scene.facts["ids of patches", None] = dict(parts), wp.array(ids, dtype=int, device=scene.device)
+    return known[1]
+
+
+def _met(
+    scene: Scene, gbuffer: GBuffer, reflector: int, pixel: wp.array, box: Box, threads: int, kernels: str
+) -> MirrorPixels:
     """The surface at some pixels of the picture."""
     n, device = len(pixel), scene.device
     if not n:
         none = wp.empty(0, dtype=wp.vec3, device=device)
-        return MirrorPixels(reflector, wp.empty(0, dtype=int, device=device), none, none, none, (0, 0, 0, 0))
+        return MirrorPixels(reflector, pixel, none, none, none, box)
     mirror = MirrorPixels(
         reflector=reflector,
-        pixel=wp.array(pixel, dtype=int, device=device),
+        pixel=pixel,
         point=wp.empty(n, dtype=wp.vec3, device=device),
         normal=wp.empty(n, dtype=wp.vec3, device=device),
         direction=wp.empty(n, dtype=wp.vec3, device=device),
-        box=pixel_bounds(pixel, gbuffer.camera.size[0]),
+        box=box,
     )
     seen = [gbuffer.view, gbuffer.triangle, gbuffer.depth_key, mirror.pixel]
     outputs = [mirror.point, mirror.normal, mirror.direction]
@@ -381,31 +392,95 @@ def part_pixels(
     found = {part: known[part] for part in parts if part in known}
     others = [part for part in parts if part not in known]
     if others:
-        for part, pixel in seen_parts(scene, gbuffer, others).items():
-            found[part] = _met(scene, gbuffer, NO_REFLECTOR, pixel, threads, kernels)
+        pixels, _ = _pixels_of(scene, gbuffer, dict(enumerate(others, 1)), threads)
+        for id, part in enumerate(others, 1):
+            found[part] = _met(scene, gbuffer, NO_REFLECTOR, *pixels[id], threads, kernels)
     return {part: pixels for part, pixels in found.items() if pixels.count}
 
 
-def seen_parts(scene: Scene, gbuffer: GBuffer, parts: Iterable[int]) -> dict[int, np.ndarray]:
-    """Ascending int32 numbers of the pixels at which the eye sees each of some parts; nothing of one that is not seen."""
-    part_of_patch = np.full(max(len(scene.patch_shapes), 1), -1)
-    for part in parts:
-        part_of_patch[list(scene.parts[part].patches)] = part
-    # The background is triangle -1: the last entry.
-    part_of_triangle = np.append(part_of_patch[scene.host_triangle_patch], -1)
-    shown = part_of_triangle[gbuffer.triangle.numpy()]
-    found = {part: np.flatnonzero(shown == part).astype(np.int32) for part in sorted(parts)}
-    return {part: pixel for part, pixel in found.items() if len(pixel)}
+def seen_parts(scene: Scene, gbuffer: GBuffer, parts: Iterable[int]) -> dict[int, int]:
+    """Number of the pixels at which the eye sees each of some parts."""
+    asked = dict(enumerate(parts, 1))
+    found, _ = _pixels_of(scene, gbuffer, asked, 0)
+    return {part: len(found[id][0]) for id, part in asked.items()}
 
 
-def _pixels_by_reflector(reflector_id: np.ndarray, parts: Mapping[int, int]) -> dict[int, np.ndarray]:
+def _pixels_by_id(ids: np.ndarray, wanted: Collection[int]) -> dict[int, np.ndarray]:
     """Ascending int32 pixel numbers of every id."""
     # The comparison makes it twice as fast as on the numbers themselves.
-    pixel = np.flatnonzero(reflector_id != 0).astype(np.int32)
-    if len(parts) == 1:
-        return dict.fromkeys(parts, pixel)
-    ids = reflector_id[pixel]
-    return {reflector: pixel[ids == reflector] for reflector in parts}
+    pixel = np.flatnonzero(ids != 0).astype(np.int32)
+    if len(wanted) == 1:
+        return dict.fromkeys(wanted, pixel)
+    ids = ids[pixel]
+    return {id: pixel[ids == id] for id in wanted}
+
+
+RUN = wp.constant(6)  # numbers of an id's run: first, end; first and last row; columns left of the right end, its end
+
+
+@wp.kernel(module=SORTED)
+def numbered_kernel(first: int, ids: wp.array(dtype=int), out_id: wp.array(dtype=int), out_pixel: wp.array(dtype=int)):
+    """One thread per pixel."""
+    i = first + wp.tid()
+    out_id[i] = ids[i]
+    out_pixel[i] = i
+
+
+@wp.kernel(module=SORTED)
+def runs_kernel(
+    first: int,
+    count: int,
+    id: wp.array(dtype=int),
+    pixel: wp.array(dtype=int),
+    width: int,
+    out_run: wp.array(dtype=int),
+):
+    """One thread per pixel, sorted by id: where an id's run begins and ends, and how far its rows reach; all 0 before."""
+    i = first + wp.tid()
+    own = id[i]
+    if own == 0:
+        return
+    row = pixel[i] // width
+    column = pixel[i] - row * width
+    before = int(0)
+    after = int(0)
+    if i > 0:
+        before = id[i - 1]
+    if i + 1 < count:
+        after = id[i + 1]
+    if before != own:
+        out_run[own * RUN] = i
+        out_run[own * RUN + 2] = row
+    if after != own:
+        out_run[own * RUN + 1] = i + 1
+        out_run[own * RUN + 3] = row
+    # Ends of rows alone: every pixel's would queue for one number.
+    left = before != own
+    if not left:
+        left = pixel[i - 1] // width != row
+    right = after != own
+    if not right:
+        right = pixel[i + 1] // width != row
+    if left:
+        wp.atomic_max(out_run, own * RUN + 4, width - column)
+    if right:
+        wp.atomic_max(out_run, own * RUN + 5, column + 1)
+
+
+def _sorted_by_id(ids: wp.array, wanted: Collection[int], width: int) -> dict[int, tuple[wp.array, Box]]:
+    """The pixels of every id and their bounds, as `_pixels_by_id` finds them, with nothing read but `RUN` numbers an id."""
+    count, device = len(ids), ids.device
+    # The sort wants room for as many again; it keeps the order of what has the same id.
+    id, pixel = (wp.empty(2 * count, dtype=int, device=device) for _ in range(2))
+    launch.launch(numbered_kernel, count, [ids, id, pixel], device)
+    wp.utils.radix_sort_pairs(id, pixel, count)
+    runs = wp.zeros((max(wanted) + 1) * RUN, dtype=int, device=device)
+    launch.launch(runs_kernel, count, [count, id, pixel, width, runs], device)
+    found = {}
+    for k, (start, end, top, bottom, before, right) in enumerate(runs.numpy().reshape(-1, RUN).tolist()):
+        if k in wanted:
+            found[k] = pixel[start:end], (width - before, top, right, bottom + 1) if end > start else (0, 0, 0, 0)
+    return found
 
 
 @wp.kernel(module=CHANNELS)

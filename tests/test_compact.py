@@ -1,0 +1,61 @@
+"""Numbers of what is meant, found on a device's way and by NumPy: the same."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import warp as wp
+
+from warp_reflect import compact, launch, surface
+from warp_reflect.layers import pixel_bounds
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize("count", [0, 1, 1000])
+def test_marked_elements_are_listed_in_order(count, share, device):
+    marks = np.where(np.random.default_rng(count).random(count) < share, 3, 1).astype(np.uint8)
+    given = wp.array(marks, dtype=wp.uint8, device=device)
+    expected = np.flatnonzero(marks == 3)
+    for way in (launch.as_device, launch.recorded):
+        with way():
+            numbers, (all_numbers, listed) = compact.marked(given, 3), compact.padded(given, 3)
+        assert numbers.dtype == wp.int32
+        np.testing.assert_array_equal(numbers.numpy(), expected)
+        assert listed.numpy().tolist() == [len(expected)]
+        np.testing.assert_array_equal(all_numbers.numpy()[: len(expected)], expected)
+        assert (all_numbers.numpy()[len(expected) :] == -1).all()
+
+
+def test_elements_are_taken_and_put_back(device):
+    values = np.arange(30, dtype=np.float32).reshape(10, 3)
+    array, numbers = wp.array(values, dtype=wp.vec3, device=device), wp.array([7, 0, 4], dtype=int, device=device)
+    some = compact.taken(array, numbers)
+    np.testing.assert_array_equal(some.numpy(), values[[7, 0, 4]])
+    changed = wp.zeros(10, dtype=wp.vec3, device=device)
+    compact.put(changed, numbers, some)
+    np.testing.assert_array_equal(changed.numpy(), np.where(np.isin(np.arange(10), [7, 0, 4])[:, None], values, 0.0))
+
+
+@pytest.mark.parametrize("wanted", [(1,), (2, 9, 4, 5)])
+@pytest.mark.parametrize("kind", ["none", "all of one", "scattered", "blocks", "over the edge"])
+def test_pixels_sorted_by_id_are_those_found_one_by_one(kind, wanted, device):
+    width, height = 37, 23
+    rng = np.random.default_rng(3)
+    ids = np.zeros((height, width), np.int32)
+    if kind == "all of one":
+        ids[:] = wanted[0]
+    elif kind == "scattered":
+        ids[:] = rng.choice([0, *wanted[:3]], ids.shape)
+    elif kind == "blocks":
+        for k, id in enumerate(wanted):
+            ids[3 + 5 * k : 6 + 5 * k, 4 + k : 20 - k] = id
+    elif kind == "over the edge":
+        ids.reshape(-1)[width - 2 : width + 3] = wanted[0]  # the end of a row and the beginning of the next
+        ids.reshape(-1)[-1] = wanted[-1]
+    flat = ids.reshape(-1)
+    expected = surface._pixels_by_id(flat, wanted)
+    found = surface._sorted_by_id(wp.array(flat, dtype=int, device=device), wanted, width)
+    assert found.keys() == expected.keys() == set(wanted)
+    for id, (pixel, box) in found.items():
+        np.testing.assert_array_equal(pixel.numpy(), expected[id])
+        assert box == pixel_bounds(expected[id], width)

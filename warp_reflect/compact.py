@@ -1,0 +1,75 @@
+"""Which elements of an array are meant: their numbers in a list, and the elements in a row, made where the array lies.
+
+Where a device is waited for to tell a number (`launch.stays`), a list's length is the only thing that is read; where arrays are
+at hand anyway NumPy finds the numbers faster than kernels do.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+
+from warp_reflect.launch import launch, stays
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def is_marked_kernel(first: int, marks: wp.array(dtype=wp.uint8), value: int, out_one: wp.array(dtype=int)):
+    """One thread per element: 1 or 0."""
+    i = first + wp.tid()
+    out_one[i] = wp.where(int(marks[i]) == value, 1, 0)
+
+
+@wp.kernel
+def list_kernel(
+    first: int, marks: wp.array(dtype=wp.uint8), value: int, end: wp.array(dtype=int), out_list: wp.array(dtype=int)
+):
+    """One thread per element; `end`: how many are marked up to it, itself included."""
+    i = first + wp.tid()
+    if int(marks[i]) == value:
+        out_list[end[i] - 1] = i
+
+
+def _listed(marks: wp.array, value: int) -> tuple[wp.array, wp.array]:
+    """(numbers of the marked elements, -1 behind them, as many as there are elements; how many up to each)."""
+    count, device = len(marks), marks.device
+    ones, ends = (wp.empty(count, dtype=int, device=device) for _ in range(2))
+    launch(is_marked_kernel, count, [marks, value, ones], device)
+    wp.utils.array_scan(ones, ends, inclusive=True)
+    numbers = wp.full(count, -1, dtype=int, device=device)
+    launch(list_kernel, count, [marks, value, ends, numbers], device)
+    return numbers, ends
+
+
+def marked(marks: wp.array, value: int) -> wp.array:
+    """Ascending numbers of the elements of a uint8 array that have a value, int32."""
+    if not stays(marks.device):
+        return wp.array(np.flatnonzero(marks.numpy() == value).astype(np.int32), dtype=int, device=marks.device)
+    if not len(marks):
+        return wp.empty(0, dtype=int, device=marks.device)
+    numbers, ends = _listed(marks, value)
+    return numbers[: int(ends[len(ends) - 1 :].numpy()[0])]
+
+
+def padded(marks: wp.array, value: int) -> tuple[wp.array, wp.array]:
+    """The same for launches over all that might be asked for: nothing is read.
+
+    Returns:
+        (numbers; where they stay on a device as many as there are elements, -1 behind the last; how many, int32 [1]).
+    """
+    if not stays(marks.device) or not len(marks):
+        numbers = marked(marks, value)
+        return numbers, wp.full(1, len(numbers), dtype=int, device=marks.device)
+    numbers, ends = _listed(marks, value)
+    return numbers, ends[len(ends) - 1 :]
+
+
+def taken(array: wp.array, numbers: wp.array) -> wp.array:
+    """The elements of an array with some numbers, in their order."""
+    return wp.indexedarray(array, [numbers]).contiguous()
+
+
+def put(array: wp.array, numbers: wp.array, values: wp.array) -> None:
+    """Write elements of an array, each at most once."""
+    wp.copy(wp.indexedarray(array, [numbers]), values)
