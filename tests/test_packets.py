@@ -6,9 +6,11 @@ import warp as wp
 from test_shade import WHITE, ball_mesh, distant, dome, ground, look_at, place, scene_of, turned
 
 import warp_reflect as wr
-from warp_reflect import bvh_vector, direct, raster, shadows, vector
+from warp_reflect import bvh, direct, raster, shadows, surface, vector
 from warp_reflect.launch import FINITE_FLAGS, launch
+from warp_reflect.layers import ReflectionLayer
 from warp_reflect.scene import LightData, MaterialData
+from warp_reflect.settings import Status, Technique
 from warp_reflect.wide_packets import TRAVERSAL
 from warp_reflect.wide_tree import WideTree
 
@@ -269,18 +271,6 @@ def test_a_tree_that_was_fitted_to_moved_points_answers_as_warps():
         np.testing.assert_array_equal(got, expected)
 
 
-def test_pixels_are_taken_tile_by_tile_each_once():
-    rng = np.random.default_rng(6)
-    width, height = 37, 22
-    pixel = np.flatnonzero(rng.random(width * height) < 0.7).astype(np.int32)
-    for threads in (1, 2):
-        order = bvh_vector.in_tiles(wp.array(pixel, dtype=int, device=CPU), width, threads).numpy()
-        y, x = np.divmod(pixel, width)
-        tile = bvh_vector.TILE
-        np.testing.assert_array_equal(order, np.lexsort((x, y, x // tile, y // tile)))
-    assert bvh_vector.in_tiles(wp.array(pixel[::-1].copy(), dtype=int, device=CPU), width) is None
-
-
 LIGHTS = [
     distant((1, 1, 1), (0.35, 1.0, 0.1)),
     distant((1, 1, 1), (0.0, 1.0, 0.0)),
@@ -297,6 +287,36 @@ def lit_balls(material=WHITE):
     balls = [(ball_mesh(), place(0, 0.8, 0, 0.5), material), (ball_mesh(), place(1, 0.5, 1, 0.4), WHITE)]
     scene = scene_of([(ground(), place(), WHITE), *balls], LIGHTS)
     return scene, look_at((0, 3.0, 4.0), (0, 0.3, 0), fov=50, size=(67, 43))
+
+
+@pytest.mark.parametrize("asked", ["all", "some", "in no order"])
+@pytest.mark.parametrize("convex", [True, False])
+def test_pixels_are_asked_in_tiles_each_once_as_one_by_one(asked, convex):
+    """Pixels with gaps, or a choice of them; rays that start on their own body, beside it, and under the open sky."""
+    rng = np.random.default_rng(6)
+    scene, _ = lit_balls(MaterialData(base_color=(1, 1, 1), metallic=1.0, roughness=0.0))
+    camera = look_at((0, 1.2, 2.0), (0, 0.8, 0), fov=50, size=(161, 90))
+    gbuffer = raster.draw_scene(scene, camera)
+    pixels = surface.mirror_pixels(scene, gbuffer, {1: 1})[0][1]
+    pixels = pixels.select(np.flatnonzero(rng.random(pixels.count) < 0.8), 1, camera.size[0])
+    index = {
+        "all": None,
+        "some": np.flatnonzero(rng.random(pixels.count) < 0.3),
+        "in no order": rng.permutation(pixels.count)[: pixels.count // 2],
+    }[asked]
+    index = None if index is None else wp.array(index, dtype=int, device=CPU)
+    found = []
+    for kernels, threads in (("plain", 1), ("vector", 1), ("vector", 2), ("vector", 8)):
+        layer = ReflectionLayer.empty(pixels, Technique.RAYTRACED, CPU)
+        how = {"kernels": kernels, "threads": threads}
+        count = bvh.trace_pixels(scene, gbuffer, pixels, layer, 1, convex, index, **how)
+        assert count == (pixels.count if index is None else len(index))
+        found.append([getattr(layer, name).numpy() for name in ("triangle", "u", "v", "distance", "status")])
+    status = found[0][-1]
+    assert pixels.count > 2000 and {Status.CONVERGED, Status.SKY} <= set(status)
+    for other in found[1:]:
+        for got, expected in zip(other, found[0], strict=True):
+            np.testing.assert_array_equal(got, expected)
 
 
 @pytest.mark.parametrize("samples", [1, 5, 16, 40])

@@ -165,7 +165,7 @@ def onward(
     """
     if not meets(scene, layer, mirrors.patches):
         return seen
-    device, bodies = scene.device, mirrors.bodies
+    device, bodies, width = scene.device, mirrors.bodies, gbuffer.camera.size[0]
     index = np.arange(layer.pixels.count, dtype=np.int32)
     weight = wp.full(layer.pixels.count, wp.vec3(1.0, 1.0, 1.0), dtype=wp.vec3, device=device)
     first, total = layer, seen
@@ -193,17 +193,17 @@ def onward(
         layer = ReflectionLayer.empty(pixels, Technique.RAYTRACED, device)
         if forward is not None and depth == 0:
             forward(layer, facet)
-            _trace_others(scene, layer, facet, bodies, threads, kernels)
+            _trace_others(scene, layer, facet, bodies, threads, kernels, width)
             add_statistics(first.statistics, layer.statistics)
         else:
-            bvh.trace_bounced(scene, layer, facet, bodies, threads, kernels)
+            bvh.trace_bounced(scene, layer, facet, bodies, threads, kernels, width)
         numbers = wp.array(index, dtype=int, device=device)
         launch.launch(add_bounce_kernel, len(going), [numbers, weight, domes, met(layer), total], device, threads)
     return total
 
 
 def _trace_others(
-    scene: Scene, layer: ReflectionLayer, facet: wp.array, bodies: wp.array, threads: int, kernels: str
+    scene: Scene, layer: ReflectionLayer, facet: wp.array, bodies: wp.array, threads: int, kernels: str, width: int
 ) -> None:
     """Trace the rays of a layer whose status is NONE."""
     others = np.flatnonzero(layer.status.numpy() == int(Status.NONE))
@@ -215,7 +215,7 @@ def _trace_others(
         for array in (pixels.pixel, pixels.point, pixels.normal, pixels.direction, facet)
     ]
     rest = ReflectionLayer.empty(MirrorPixels(pixels.reflector, *some[:4], pixels.box), layer.method, scene.device)
-    bvh.trace_bounced(scene, rest, some[4], bodies, threads, kernels)
+    bvh.trace_bounced(scene, rest, some[4], bodies, threads, kernels, width)
     for name in ("triangle", "u", "v", "distance", "status"):
         host = getattr(layer, name).numpy()
         host[others] = getattr(rest, name).numpy()

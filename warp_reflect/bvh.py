@@ -51,7 +51,6 @@ RAYS_A_TRIANGLE = 0.25
 TRACE_SPLIT_MIN = 512  # rays; at 0.3 us and more a ray, half of them outweigh the hand-off to a second thread
 
 UNASKED = wp.constant(-2)  # `bvh_vector.UNASKED`
-NONE = wp.constant(int(Status.NONE))
 HIT = wp.constant(int(Status.CONVERGED))
 SKY = wp.constant(int(Status.SKY))
 STEP_LIMIT = wp.constant(int(Status.STEP_LIMIT))
@@ -348,8 +347,6 @@ def trace_pixels_kernel(
     i = first + wp.tid()
     if indexed != 0:
         i = index[i]
-    if known != 0 and int(out_status[i]) != NONE:
-        return
     met = answered(known, out_triangle[i], out_u[i], out_v[i], out_distance[i])
     hit = trace_ray_from(mesh_id, scene, point[i], direction[i], normal[i], facets[pixel[i]], body, 0, 0.0, met)
     out_triangle[i] = hit.triangle
@@ -537,6 +534,8 @@ def trace_bounced_kernel(
     normal: wp.array(dtype=wp.vec3),
     direction: wp.array(dtype=wp.vec3),
     bodies: wp.array(dtype=OwnBody),
+    index: wp.array(dtype=int),
+    indexed: int,
     known: int,
     # Outputs:
     out_triangle: wp.array(dtype=int),
@@ -545,10 +544,10 @@ def trace_bounced_kernel(
     out_distance: wp.array(dtype=float),
     out_status: wp.array(dtype=wp.uint8),
 ):
-    """One thread per ray; known 1: what `bvh_vector.first_met` has left."""
+    """One thread per asked ray; known 1: what `bvh_vector.first_met` has left."""
     i = first + wp.tid()
-    if known != 0 and int(out_status[i]) != NONE:
-        return
+    if indexed != 0:
+        i = index[i]
     body = bodies[scene.triangle_patch[facet[i]]]
     met = answered(known, out_triangle[i], out_u[i], out_v[i], out_distance[i])
     hit = trace_ray_from(mesh_id, scene, point[i], direction[i], normal[i], facet[i], body, 1, 0.0, met)
@@ -758,17 +757,30 @@ def trace_pixels(
         scene, scene.mirror_tracer(part), layer, start, index, False, threads, kernels, width
     )
     if left:
-        inputs = [*rays, known, *outputs]
-        launch.launch(trace_pixels_kernel, count, inputs, scene.device, threads, split_min=TRACE_SPLIT_MIN)
+        some = _with_status(layer, index, Status.NONE) if known else rays[8:]
+        inputs = [*rays[:8], *some, known, *outputs]
+        launch.launch(trace_pixels_kernel, len(some[0]), inputs, scene.device, threads, split_min=TRACE_SPLIT_MIN)
     if left or missed:
+        some = _with_status(layer, index, Status.SKY) if known else rays[8:]
         # The neighbours' answers are read from a copy, so that the order of threads cannot matter.
-        before = wp.clone(layer.status)
-        launch.launch(retry_pixels_kernel, count, [*rays, before, *outputs], scene.device, threads)
+        inputs = [*rays[:8], *some, wp.clone(layer.status), *outputs]
+        launch.launch(retry_pixels_kernel, len(some[0]), inputs, scene.device, threads)
     if scene.has_hole is not None:
         _past_holes(
             scene, layer, scene.mirror_tracer(part), gbuffer.triangle, pixels.pixel, body=rays[7], threads=threads
         )
     return count
+
+
+def _with_status(layer: ReflectionLayer, index: wp.array | None, status: Status) -> list:
+    """Which of the rays asked have a status: int32, and 1."""
+    found = layer.status.numpy()
+    if index is None:
+        some = np.flatnonzero(found == status)
+    else:
+        asked = index.numpy()
+        some = asked[found[asked] == status]
+    return [wp.array(some, dtype=int, device=layer.status.device), 1]
 
 
 def _first_met(
@@ -793,11 +805,11 @@ def _first_met(
     from warp_reflect import bvh_vector  # not compiled where it is not asked for
 
     rays = [pixels.point, pixels.normal, pixels.direction]
-    if index is None and width > 0:
-        index = bvh_vector.in_tiles(pixels.pixel, width, threads)
     outputs = [layer.triangle, layer.u, layer.v, layer.distance, layer.status]
     start = [*start, scene.view.triangle_patch]
-    state = bvh_vector.first_met(tracer.packets, scene.triangle_records, rays, start, index, retry, outputs, threads)
+    state = bvh_vector.first_met(
+        tracer.packets, scene.triangle_records, rays, start, index, pixels.pixel, width, retry, outputs, threads
+    )
     return 1, bool(state & bvh_vector.LEFT), bool(state & bvh_vector.MISSED)
 
 
@@ -837,7 +849,13 @@ def _past_holes(scene: Scene, layer: ReflectionLayer, tracer: Tracer, facet: wp.
 
 
 def trace_bounced(
-    scene: Scene, layer: ReflectionLayer, facet: wp.array, bodies: wp.array, threads: int = 0, kernels: str = "auto"
+    scene: Scene,
+    layer: ReflectionLayer,
+    facet: wp.array,
+    bodies: wp.array,
+    threads: int = 0,
+    kernels: str = "auto",
+    width: int = 0,
 ) -> None:
     """Follow rays that mirrors of any bodies reflect and write their hits into the layer.
 
@@ -848,14 +866,17 @@ def trace_bounced(
         bodies: `OwnBody` of every patch.
         threads: CPU threads; 0: one per core.
         kernels: `Settings.kernels`.
+        width: Of the picture that the pixels are of; 0: not known.
     """
     pixels = layer.pixels
     start = [facet, wp.zeros(0, dtype=int, device=scene.device), OwnBody(), bodies]
-    known, left, _ = _first_met(scene, scene.tracer, layer, start, None, True, threads, kernels, 0)
+    known, left, _ = _first_met(scene, scene.tracer, layer, start, None, True, threads, kernels, width)
     if left:
+        some = _with_status(layer, None, Status.NONE) if known else [facet, 0]
+        count = len(some[0]) if known else pixels.count
         inputs = [wp.uint64(scene.tracer.id), scene.view, facet, pixels.point, pixels.normal, pixels.direction]
-        inputs += [bodies, known, layer.triangle, layer.u, layer.v, layer.distance, layer.status]
-        launch.launch(trace_bounced_kernel, pixels.count, inputs, scene.device, threads, split_min=TRACE_SPLIT_MIN)
+        inputs += [bodies, *some, known, layer.triangle, layer.u, layer.v, layer.distance, layer.status]
+        launch.launch(trace_bounced_kernel, count, inputs, scene.device, threads, split_min=TRACE_SPLIT_MIN)
     if scene.has_hole is not None:
         _past_holes(scene, layer, scene.tracer, facet, bodies=bodies, threads=threads)
 

@@ -20,55 +20,16 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FINITE_FL
 BLOCK_SPLIT_MIN = 8  # blocks; what `bvh.TRACE_SPLIT_MIN` rays are
 LEFT, MISSED = 1, 2  # flags of a block: rays are left to the plain kernels, some meet nothing
 UNASKED = -2  # a triangle: nothing is known of what the ray meets
-TILE = 4  # pixels along a side of a packet's part of the picture: a square one is met by the fewest boxes
+# Pixels of a packet's part of the picture: as many as share most of a walk down the tree; a nearly square part meets few boxes.
+TILE_WIDTH, TILE_HEIGHT = 8, 4
+STRIP = 64  # pixels along a task's row of tiles
 
 
 _CONSTANTS = f"""
     constexpr int NONE = {int(Status.NONE)}, CONVERGED = {int(Status.CONVERGED)}, SKY = {int(Status.SKY)};
     constexpr int LEFT = {LEFT}, MISSED = {MISSED}, UNASKED = {UNASKED};
+    constexpr int TILE_WIDTH = {TILE_WIDTH}, TILE_HEIGHT = {TILE_HEIGHT}, STRIP = {STRIP};
 """
-
-
-@wp.func_native(
-    vector.snippet(r"""
-    const int* numbers = pixel.data;
-    const int count = pixel.shape[0];
-    auto place_of = [&](int number) -> int {
-        int low = 0, high = count;
-        while (low < high) {
-            const int middle = (low + high) / 2;
-            if (numbers[middle] < number) low = middle + 1;
-            else high = middle;
-        }
-        return low;
-    };
-    int at[4], end[4];
-    for (int row = 0; row < 4; ++row) {
-        at[row] = place_of((4 * band + row) * width);
-        end[row] = place_of((4 * band + row + 1) * width);
-    }
-    int place = at[0];
-    while (true) {
-        int next = width;
-        for (int row = 0; row < 4; ++row) {
-            const int x = at[row] < end[row] ? numbers[at[row]] - (4 * band + row) * width : width;
-            next = x < next ? x : next;
-        }
-        if (next == width) return;
-        const int after = (next & ~3) + 4;
-        for (int row = 0; row < 4; ++row)
-            while (at[row] < end[row] && numbers[at[row]] - (4 * band + row) * width < after)
-                out_order.data[place++] = at[row]++;
-    }
-""")
-)
-def order_band(band: int, pixel: wp.array(dtype=int), width: int, out_order: wp.array(dtype=int)): ...
-
-
-@wp.kernel
-def order_kernel(first: int, pixel: wp.array(dtype=int), width: int, out_order: wp.array(dtype=int)):
-    """One thread per `TILE` rows of the picture, whose pixels lie together."""
-    order_band(first + wp.tid(), pixel, width, out_order)
 
 
 @wp.func_native(
@@ -77,12 +38,70 @@ def order_kernel(first: int, pixel: wp.array(dtype=int), width: int, out_order: 
         + TRAVERSAL
         + r"""
     const int count = indexed != 0 ? index.shape[0] : point.shape[0];
-    const int begin = block * BLOCK;
-    const int end = begin + BLOCK < count ? begin + BLOCK : count;
     const float* points = (const float*)point.data;
     const float* normals = (const float*)normal.data;
     const float* directions = (const float*)direction.data;
-    // Of a tile's row, whose four pixels follow one another: rows are read and turned.
+    // What is at a place of the order that is asked for.
+    auto ray_at = [&](int place) -> int { return indexed != 0 ? index.data[place] : place; };
+    auto number_at = [&](int place) -> int { return numbers.data[ray_at(place)]; };
+    // Rays that go together: those of a tile, row by row of either half, or the next of a block.
+    constexpr int RAYS = TILE_WIDTH * TILE_HEIGHT, GROUPS = RAYS / LANES;
+    struct Tile { enum { value = GROUPS }; };
+    int ray[RAYS], taken = 0;
+    int at[TILE_HEIGHT], stop[TILE_HEIGHT], next_place = block * BLOCK;
+    const int last_place = next_place + BLOCK < count ? next_place + BLOCK : count;
+    const int strips = width > 0 ? (width + STRIP - 1) / STRIP : 1;
+    const int top = TILE_HEIGHT * (first_band + block / strips), first_x = STRIP * (block % strips);
+    if (width > 0) {
+        auto place_of = [&](int number, int low, int high) -> int {
+            while (low < high) {
+                const int middle = (low + high) / 2;
+                if (number_at(middle) < number) low = middle + 1;
+                else high = middle;
+            }
+            return low;
+        };
+        const int right = first_x + STRIP < width ? first_x + STRIP : width;
+        int low = place_of(top * width + first_x, 0, count);
+        const int high = place_of((top + TILE_HEIGHT - 1) * width + right, low, count);
+        for (int row = 0; row < TILE_HEIGHT; ++row) {
+            at[row] = low = place_of((top + row) * width + first_x, low, high);
+            stop[row] = low = place_of((top + row) * width + right, low, high);
+        }
+    }
+    auto take = [&]() {
+        taken = 0;
+        if (width == 0) {
+            while (taken < RAYS && next_place < last_place) ray[taken++] = ray_at(next_place++);
+            return;
+        }
+        int x = width;
+        for (int row = 0; row < TILE_HEIGHT; ++row) {
+            const int own = at[row] < stop[row] ? number_at(at[row]) - (top + row) * width : width;
+            x = own < x ? own : x;
+        }
+        if (x == width) return;
+        x -= (x - first_x) % TILE_WIDTH;
+        int middle[TILE_HEIGHT], end[TILE_HEIGHT];
+        for (int row = 0; row < TILE_HEIGHT; ++row) {
+            const int own = (top + row) * width + x;
+            int k = at[row];
+            if (k + TILE_WIDTH <= stop[row] && number_at(k + TILE_WIDTH - 1) == own + TILE_WIDTH - 1) {
+                middle[row] = k + TILE_WIDTH / 2;
+                end[row] = k + TILE_WIDTH;
+                continue;
+            }
+            while (k < stop[row] && number_at(k) < own + TILE_WIDTH / 2) ++k;
+            middle[row] = k;
+            while (k < stop[row] && number_at(k) < own + TILE_WIDTH) ++k;
+            end[row] = k;
+        }
+        for (int half = 0; half < 2; ++half)
+            for (int row = 0; row < TILE_HEIGHT; ++row)
+                for (int k = half ? middle[row] : at[row]; k < (half ? end[row] : middle[row]); ++k) ray[taken++] = ray_at(k);
+        for (int row = 0; row < TILE_HEIGHT; ++row) at[row] = end[row];
+    };
+    // Where rays follow one another in fours, as in full tiles: rows are read and turned.
     const I in_row = lanes() & 3;
     auto by_rows = [&](I own) -> bool {
         I first;
@@ -125,18 +144,16 @@ def order_kernel(first: int, pixel: wp.array(dtype=int), width: int, out_order: 
         met.v = pick(hit, pick(beyond, cv / total, cv), F(0.0f));
     };
     int state = 0;
-    for (int start = begin; start < end; start += 2 * LANES) {
-        V from[2], o[2], d[2], along[2];
-        I live[2], own[2];
-        F reach[2];
-        Met met[2];
-        bool ordered[2];
-        I moved[2] = {I(0), I(0)};
-        for (int g = 0; g < 2; ++g) {
-            const I element = start + g * LANES + lanes();
-            live[g] = element < end;
-            own[g] = ipick(live[g], element, I(end - 1));
-            if (indexed != 0) own[g] = igather(index.data, own[g]);
+    for (take(); taken > 0; take()) {
+        for (int k = taken; k < RAYS; ++k) ray[k] = ray[taken - 1];
+        V from[GROUPS], o[GROUPS], d[GROUPS], along[GROUPS];
+        I live[GROUPS], own[GROUPS], moved[GROUPS], missed[GROUPS];
+        F reach[GROUPS];
+        Met met[GROUPS];
+        bool ordered[GROUPS];
+        for (int g = 0; g < GROUPS; ++g) {
+            live[g] = g * LANES + lanes() < taken;
+            own[g] = iload(ray + g * LANES);
             ordered[g] = by_rows(own[g]);
             from[g] = rows(points, own[g], ordered[g]);
             along[g] = rows(directions, own[g], ordered[g]);
@@ -146,12 +163,14 @@ def order_kernel(first: int, pixel: wp.array(dtype=int), width: int, out_order: 
             o[g] = add(from[g], times(offset, rows(normals, own[g], ordered[g])));
             d[g] = flushed(along[g]);
             reach[g] = F(3.0e38f);
+            moved[g] = I(0);
+            missed[g] = live[g];
         }
-        I missed[2] = {live[0], live[1]};
         for (int round = 0; round < 2; ++round) {
-            Met found[2];
-            first_met_by(missed, o, d, reach, found);
-            for (int g = 0; g < 2; ++g) {
+            Met found[GROUPS];
+            traverse(Nearest{}, Tile{}, missed, o, d, reach, found);
+            I some = I(0);
+            for (int g = 0; g < GROUPS; ++g) {
                 Met& m = met[g];
                 if (round == 0) {
                     m = found[g];
@@ -163,14 +182,14 @@ def order_kernel(first: int, pixel: wp.array(dtype=int), width: int, out_order: 
                     moved[g] = missed[g];
                 }
                 missed[g] &= found[g].face < 0;
+                some |= missed[g];
                 // bvh.moved_direction
                 const F step = 8.0f * 1.1920929e-7f * size(d[g]);
                 d[g] = vpick(missed[g], add(d[g], V{step, -0.625f * step, 0.375f * step}), d[g]);
             }
-            if (retry == 0 || !bits(missed[0] | missed[1])) break;
+            if (retry == 0 || !bits(some)) break;
         }
-        for (int g = 0; g < 2; ++g) {
-            if (!bits(live[g])) break;
+        for (int g = 0; g < GROUPS; ++g) {
             const I facet = igather(facets.data, pixel.shape[0] > 0 ? igather(pixel.data, own[g]) : own[g]);
             I first = I(body.first_triangle), length = I(body.triangle_count);
             if (bodies.shape[0] > 0) {
@@ -232,6 +251,9 @@ def first_met_block(
     patches: wp.array(dtype=int),
     index: wp.array(dtype=int),
     indexed: int,
+    numbers: wp.array(dtype=int),
+    width: int,
+    first_band: int,
     retry: int,
     out_triangle: wp.array(dtype=int),
     out_u: wp.array(dtype=float),
@@ -260,6 +282,9 @@ def first_met_blocks_kernel(
     # Which are asked:
     index: wp.array(dtype=int),
     indexed: int,
+    numbers: wp.array(dtype=int),
+    width: int,
+    first_band: int,
     retry: int,
     # Outputs:
     out_triangle: wp.array(dtype=int),
@@ -269,7 +294,7 @@ def first_met_blocks_kernel(
     out_status: wp.array(dtype=wp.uint8),
     out_state: wp.array(dtype=int),
 ):
-    """One thread per block of asked rays."""
+    """One thread per block of asked rays; width > 0: per `STRIP` of a row of tiles of the picture."""
     block = first + wp.tid()
     first_met_block(
         block,
@@ -285,6 +310,9 @@ def first_met_blocks_kernel(
         patches,
         index,
         indexed,
+        numbers,
+        width,
+        first_band,
         retry,
         out_triangle,
         out_u,
@@ -295,23 +323,14 @@ def first_met_blocks_kernel(
     )
 
 
-def in_tiles(pixel: wp.array, width: int, threads: int = 0) -> wp.array | None:
-    """The order of pixels tile by tile: int32 indices into `pixel`, of a picture of `width`; None: they do not ascend."""
-    numbers, device = pixel.numpy(), pixel.device
-    if len(numbers) == 0 or numbers[0] < 0 or not (numbers[1:] > numbers[:-1]).all():
-        return None
-    order = wp.empty(len(numbers), dtype=int, device=device)
-    bands = int(numbers[-1]) // (TILE * width) + 1
-    launch(order_kernel, bands, [pixel, width, order], device, threads, split_min=BLOCK_SPLIT_MIN)
-    return order
-
-
 def first_met(
     mesh: int,
     records: wp.array,
     rays: list[wp.array],
     start: list,
     index: wp.array | None,
+    numbers: wp.array,
+    width: int,
     retry: bool,
     outputs: list[wp.array],
     threads: int = 0,
@@ -325,6 +344,8 @@ def first_met(
         start: Where they start: facets; int32, where among these that of each ray is, none: in order; the body of all of
             them; bodies of patches, none: that body; the patches of triangles.
         index: int32, which of the rays; None: all.
+        numbers: int32, the pixels of rays.
+        width: Of their picture, whose tiles stay together where the pixels of the rays asked ascend; 0: there is none.
         retry: A ray that meets nothing is asked once more, turned by a few ulp.
         outputs: Triangle, u, v, t, status of the rays asked. What meets its own facet or body first is left: status NONE, with
             what was met (u and v as Warp's queries name them), or triangle `UNASKED`.
@@ -334,9 +355,28 @@ def first_met(
         `LEFT` and `MISSED`, where they hold for any ray.
     """
     device = rays[0].device
-    blocks = vector.block_count(len(rays[0]) if index is None else len(index))
-    which = [wp.zeros(0, dtype=int, device=device) if index is None else index, int(index is not None), int(retry)]
+    blocks, first_band = vector.block_count(len(rays[0]) if index is None else len(index)), 0
+    if width > 0:
+        own = numbers.numpy() if index is None else numbers.numpy()[index.numpy()]
+        if own[0] >= 0 and (own[1:] > own[:-1]).all():
+            first_band = int(own[0]) // (TILE_HEIGHT * width)
+            blocks = (int(own[-1]) // (TILE_HEIGHT * width) + 1 - first_band) * -(-width // STRIP)
+        else:
+            width = 0
+    which = [wp.zeros(0, dtype=int, device=device) if index is None else index, int(index is not None)]
     state = wp.empty(blocks, dtype=int, device=device)
-    inputs = [wp.uint64(mesh), records, *rays, *start, *which, *outputs, state]
+    inputs = [
+        wp.uint64(mesh),
+        records,
+        *rays,
+        *start,
+        *which,
+        numbers,
+        width,
+        first_band,
+        int(retry),
+        *outputs,
+        state,
+    ]
     launch(first_met_blocks_kernel, blocks, inputs, device, threads, split_min=BLOCK_SPLIT_MIN)
     return int(np.bitwise_or.reduce(state.numpy()))
