@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 import warp as wp
 
-from warp_reflect import bvh, launch, vector
+from warp_reflect import launch, trees, vector
 from warp_reflect.cubemap import FACE_COUNT, radiance_direction
 from warp_reflect.environment_maps import CubeMaps, Onward
 from warp_reflect.launch import FINITE_FLAGS
@@ -49,7 +49,7 @@ class Moving:
         part: Of each, index into the scene's parts, int [n].
     """
 
-    tree: bvh.Tree
+    tree: trees.Tree
     vertex: np.ndarray
     number: np.ndarray
     part: np.ndarray
@@ -311,7 +311,7 @@ def _movers(scene: Scene) -> Movers:
         device = scene.device
         points = wp.array(scene.host_points[vertex], dtype=wp.vec3, device=device)
         indices = wp.array(place[scene.host_triangles[number]].reshape(-1), dtype=wp.int32, device=device)
-        scene.environments[(KEY,)] = _at(scene, Moving(bvh.Tree(points, indices, part), vertex, number, part))
+        scene.environments[(KEY,)] = _at(scene, Moving(trees.Tree(points, indices, part), vertex, number, part))
     return scene.environments[(KEY,)]
 
 

@@ -1,0 +1,65 @@
+"""Warp's structure over triangles, and the wide one of packets beside it: built once, fitted where points have moved."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import warp as wp
+
+from warp_reflect.scene import Scene
+
+if TYPE_CHECKING:
+    from warp_reflect.wide_tree import WideTree
+
+
+class Tree:
+    """Triangles in a BVH, laid out once and fitted to the points of who asks; several times of a stage may share one.
+
+    Attributes:
+        mesh: Owner of the structure.
+    """
+
+    def __init__(self, points: wp.array, indices: wp.array, groups: np.ndarray | None = None):
+        """Lay it out after points, which it keeps; `groups`: of every triangle, each in a branch of its own."""
+        constructor = "lbvh" if points.device.is_cuda else "sah"
+        of_triangle = None if groups is None else wp.array(groups, dtype=wp.int32, device=points.device)
+        self.mesh = wp.Mesh(points, indices, bvh_constructor=constructor, groups=of_triangle)
+        self._wide: WideTree | None = None
+        self._fitted: wp.array | None = points
+
+    def to(self, points: wp.array) -> Tree:
+        """Fit it to points, if it is not."""
+        if self._fitted is not points:
+            if self.mesh.points is not points:
+                wp.copy(self.mesh.points, points)
+            self.mesh.refit()
+            if self._wide is not None:
+                self._wide.fit()
+            self._fitted = points
+        return self
+
+    def loosen(self) -> None:
+        """Points were moved in place: it is fitted when it is asked for next."""
+        self._fitted = None
+
+    @property
+    def packets(self) -> int:
+        """Handle for the snippets of `wide_packets.py`; on the CPU only, laid out at first use."""
+        if self._wide is None:
+            from warp_reflect.wide_tree import WideTree  # not compiled where there are no packets
+
+            self._wide = WideTree(self.mesh)
+        return self._wide.id
+
+
+def resting_tree(scene: Scene, indices: wp.array) -> Tree:
+    """A tree for all times of a stage, over its triangles' flat indices.
+
+    It follows from what stands still and from the shapes of what moves, each in a branch of its own, wherever that stands: rays
+    meet the same at a time whichever was looked at before.
+    """
+    groups = np.zeros(scene.triangle_count, np.int32)
+    for part in (scene.parts[k] for k in scene.moving_parts):
+        groups[part.first_triangle : part.first_triangle + part.triangle_count] = part.prim
+    return Tree(wp.array(scene.points_at_rest, dtype=wp.vec3, device=scene.device), indices, groups)
