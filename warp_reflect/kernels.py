@@ -26,7 +26,12 @@ ROW_MULTIPLE = 16  # `local_maps.ROW_MULTIPLE`, whose import would build Warp's 
 ROWS = {
     "planar": (*FORWARD, "techniques.planar"),
     "quadric": (*FORWARD, "techniques.quadric_patch", "|techniques.quadric_vector"),
-    "reflector_map": (*FORWARD, "techniques.reflector_map", "|techniques.map_vector"),
+    "reflector_map": (
+        *FORWARD,
+        "techniques.reflector_map",
+        "|techniques.map_vector",
+        "-techniques.reflector_map/plain",
+    ),
     "explosion_map": (*FORWARD, "techniques.explosion_map"),
     "environment": ("environment_maps",),
     "layered_environment": (

@@ -77,7 +77,7 @@ wp.set_module_options({"enable_backward": False})
             const F share = length(sub(target, s.p)) / fmax(reach, F(1.0e-20f));
             const F left = law.residual * (law.cos_eye + law.cos_target) * estimate * share * share;
             done = tried & (law.residual < accepted) & (left < tolerance);
-            if (bits(done)) settle(done, vertex, x, law.residual, virtual_vertex(s.p, s.n, target), reach);
+            if (bits(done)) settle(done, I(converged), vertex, x, law.residual, virtual_vertex(s.p, s.n, target), reach);
         }
         for (unsigned left = bits(asked & ~done); left != 0; left &= left - 1) {
             const int l = __builtin_ctz(left), i = vertices[start + l];

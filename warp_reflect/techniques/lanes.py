@@ -71,7 +71,7 @@ VIRTUAL_VERTEX = r"""
     float* seeds = (float*)out_vertex.seed.data;
     float* positions = (float*)out_vertex.position.data;
     const bool placed = out_vertex.position.shape[0] > 0;
-    auto settle = [&](I done, I vertex, V seed, F residual, V image, F reach) {
+    auto settle = [&](I done, I answer, I vertex, V seed, F residual, V image, F reach) {
         const F depth = dot(spread(camera.forward), image);
         F x = camera.x_row[0] * image.x + camera.x_row[1] * image.y + camera.x_row[2] * image.z + camera.x_row[3];
         F y = camera.y_row[0] * image.x + camera.y_row[1] * image.y + camera.y_row[2] * image.z + camera.y_row[3];
@@ -88,13 +88,14 @@ VIRTUAL_VERTEX = r"""
         // By memory: the compiler would store a whole vector for every lane that is taken out of it.
         const F each[9] = {x, y, key, depth, reach, residual, seed.x, seed.y, seed.z};
         float lane[9][LANES], place[3][LANES];
-        int to[LANES];
+        int to[LANES], as[LANES];
         for (int k = 0; k < 9; ++k) store(lane[k], each[k]);
         store(place[0], image.x); store(place[1], image.y); store(place[2], image.z);
         istore(to, vertex);
+        istore(as, answer);
         for (unsigned left = bits(done); left != 0; left &= left - 1) {
             const int l = __builtin_ctz(left), i = to[l];
-            status[i] = (unsigned char)converged;
+            status[i] = (unsigned char)as[l];
             out_vertex.reach.data[i] = lane[4][l];
             out_vertex.residual.data[i] = lane[5][l];
             for (int k = 0; k < 4; ++k) screen[4 * i + k] = lane[k][l];
@@ -113,7 +114,7 @@ REFLECTOR_MAP = r"""
     const float* texels = (const float*)map.texels.data;
     const int resolution = map.resolution;
     const float scale = 0.5f * (float)(resolution - 1);
-    struct Sample { V p, p_u, p_v, n, n_u, n_v; };
+    struct Sample { V p, p_u, p_v, n, n_u, n_v; F mask; };
     struct Law { F residual, cos_eye, cos_target; };
     // cubemap.project_to_cube
     auto project_to_cube = [&](V x) -> V {
@@ -158,6 +159,8 @@ REFLECTOR_MAP = r"""
         s.n = times(inv, raw);
         s.n_u = times(inv, n_u);
         s.n_v = times(inv, n_v);
+        // reflector_maps.least_mask
+        s.mask = fmin(fmin(t00[3], t01[3]), fmin(t10[3], t11[3]));
         return s;
     };
     auto measure = [&](const Sample& s, V target) -> Law {

@@ -280,7 +280,9 @@ def search_newton(
             used = evaluations
             x = coarse_seed(map, eye, target)
             # The coarse seed may be worse than where the first start got stuck, and must replace it all the same.
+            best = SearchResult()
             best.residual = 1.0e30
+            shrink = 1.0
         elif shrink < SHRINK_MIN:
             break
         else:

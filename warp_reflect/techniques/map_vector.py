@@ -1,8 +1,7 @@
 """The Newton search in a reflector map (`map_search.solve_vertex`) for a block of vertices at a time.
 
-The same steps with the same decisions in every lane. Visible vertices of the block are moved together first; a vector goes
-on while any of its lanes does. Left without a status, for the plain kernel: searches that do not end near a root, which
-start again from a coarse seed, and answers beside creases.
+The same steps with the same decisions in every lane. Visible vertices of the block are moved together first, and again
+where few of a vector's lanes go on and where searches that did not end near a root start from a coarse seed.
 """
 
 from __future__ import annotations
@@ -15,15 +14,19 @@ from warp_reflect.reflector_maps import ReflectorMapView
 from warp_reflect.techniques.lanes import REFLECTOR_MAP, VIRTUAL_VERTEX
 from warp_reflect.techniques.map_search import (
     ACCEPTED,
+    COARSE_NODES,
     CONVERGED,
     GAUGE_INSIDE,
     GAUGE_STEPS,
+    GRAZING_COS,
     HIDDEN,
+    MAX_ITERATIONS,
     NORMAL_PART_MIN,
     RETRY_SHRINK,
     SHRINK_MIN,
     SPD_SHARE,
     STEP_CAP,
+    UNREFLECTED,
     SearchSettings,
 )
 from warp_reflect.techniques.vertices import ESTIMATE, SolveFrame, VertexView
@@ -112,40 +115,175 @@ wp.set_module_options({"enable_backward": False})
             }
         }
     }
-    for (int l = 0; l < LANES && searched > 0; ++l) {
-        for (int k = 0; k < 6; ++k) at[k][searched + l] = at[k][searched - 1];
-        vertex_of[searched + l] = vertex_of[searched - 1];
-    }
-
-    for (int start = 0; start < searched; start += LANES) {
-        const I asked = start + lanes() < searched;
-        const V target = V{load(at[0] + start), load(at[1] + start), load(at[2] + start)};
-        V x = V{load(at[3] + start), load(at[4] + start), load(at[5] + start)};
-        // map_search.search_newton
-        V best = x, p = same(0.0f), n = same(0.0f), step = same(0.0f);
-        F residual = F(1.0e30f), shrink = F(1.0f);
-        I going = asked;
-        for (int used = 1; used <= settings.iterations; ++used) {
-            const Sample s = sample(x);
-            const F here = measure(s, target).residual;
-            const I better = going & (here < residual);
-            best = vpick(better, x, best);
-            p = vpick(better, s.p, p);
-            n = vpick(better, s.n, n);
-            residual = pick(better, here, residual);
-            shrink = pick(better, F(1.0f), shrink * retry_shrink);
-            going &= ~(residual <= settings.tolerance) & (shrink >= shrink_min);
-            if (!bits(going) || used == settings.iterations) break;
-            step = vpick(better, newton_step(s, target), step);
-            x = vpick(going, step_on_cube(best, p, step, shrink), x);
+    // map_search.search_newton. A vector goes on while more than FEW of its lanes do: the others of the block go on side by
+    // side in the second round, and those that ended far from a root start again from a coarse seed in the third.
+    constexpr int ROUND_FIRST = 0, ROUND_FEW = 1, ROUND_COARSE = 2, FEW = 4;
+    enum { BEST = 3, STEP = 6, RESIDUAL = 9, SHRINK = 10, KEPT = 11 };
+    float few[KEPT][BLOCK + LANES], far[3][BLOCK + LANES];
+    int few_vertex[BLOCK + LANES], few_used[BLOCK + LANES], far_vertex[BLOCK + LANES];
+    int few_count = 0, far_count = 0;
+    for (int round = ROUND_FIRST; round <= ROUND_COARSE; ++round) {
+        const int going_on = round == ROUND_FIRST ? searched : round == ROUND_FEW ? few_count : far_count;
+        if (going_on == 0) continue;
+        float* rows = round == ROUND_FIRST ? at[0] : round == ROUND_FEW ? few[0] : far[0];
+        int* numbers = round == ROUND_FIRST ? vertex_of : round == ROUND_FEW ? few_vertex : far_vertex;
+        constexpr int ROW = BLOCK + LANES;
+        const int kept = round == ROUND_FIRST ? 6 : round == ROUND_FEW ? KEPT : 3;
+        for (int l = 0; l < LANES; ++l) {
+            for (int k = 0; k < kept; ++k) rows[k * ROW + going_on + l] = rows[k * ROW + going_on - 1];
+            numbers[going_on + l] = numbers[going_on - 1];
+            if (round == ROUND_FEW) few_used[going_on + l] = few_used[going_on - 1];
         }
-        const I done = asked & (residual <= accepted);
-        if (bits(asked & ~done)) out_left.data[block] = 1;
-        if (!bits(done)) continue;
-        const F reach = edge_reach(p, n, target, F(map.least_curvature));
-        settle(done, iload(vertex_of + start), best, residual, virtual_vertex(p, n, target), reach);
+        if (round == ROUND_COARSE) {
+            // map_search.coarse_seed: the nodes are read once, then every target looks at all of them.
+            constexpr int SIDE = COARSE_NODES, NODES = 6 * SIDE * SIDE, PADDED = (NODES + LANES - 1) / LANES * LANES;
+            float node_p[3][PADDED], node_n[3][PADDED], node_x[3][PADDED];
+            for (int first = 0; first < PADDED; first += LANES) {
+                const I k = first + lanes(), face = k / (SIDE * SIDE);
+                const F u = (2.0f * __builtin_convertvector(k % SIDE, F) + 1.0f) / (float)SIDE - 1.0f;
+                const F v = (2.0f * __builtin_convertvector(k / SIDE % SIDE, F) + 1.0f) / (float)SIDE - 1.0f;
+                const F side = 1.0f - 2.0f * __builtin_convertvector(face % 2, F);
+                const I on_z = face >= 4, on_y = (face >= 2) & ~on_z;
+                const V x = vpick(on_z, V{u, v, side}, vpick(on_y, V{v, side, u}, V{side, u, v}));
+                const Sample s = sample(x);
+                store(node_p[0] + first, s.p.x); store(node_p[1] + first, s.p.y); store(node_p[2] + first, s.p.z);
+                store(node_n[0] + first, s.n.x); store(node_n[1] + first, s.n.y); store(node_n[2] + first, s.n.z);
+                store(node_x[0] + first, x.x); store(node_x[1] + first, x.y); store(node_x[2] + first, x.z);
+            }
+            for (int j = 0; j < far_count; ++j) {
+                const V target = V{F(far[0][j]), F(far[1][j]), F(far[2][j])};
+                F least = F(1.0e30f);
+                I where = I(-1);
+                for (int first = 0; first < PADDED; first += LANES) {
+                    Sample s;
+                    s.p = V{load(node_p[0] + first), load(node_p[1] + first), load(node_p[2] + first)};
+                    s.n = V{load(node_n[0] + first), load(node_n[1] + first), load(node_n[2] + first)};
+                    const Law law = measure(s, target);
+                    const I k = first + lanes();
+                    const I less = (law.residual < least) & (law.cos_eye > 0.0f) & (law.cos_target > 0.0f) & (k < NODES);
+                    least = pick(less, law.residual, least);
+                    where = ipick(less, k, where);
+                }
+                float lane[LANES];
+                int node[LANES], found = -1;
+                store(lane, least);
+                istore(node, where);
+                float best = 1.0e30f;
+                for (int l = 0; l < LANES; ++l) {
+                    if (node[l] >= 0 && (lane[l] < best || (lane[l] == best && node[l] < found))) {
+                        best = lane[l];
+                        found = node[l];
+                    }
+                }
+                // The places of the first round are free by now.
+                for (int k = 0; k < 3; ++k) {
+                    at[k][j] = far[k][j];
+                    at[3 + k][j] = found >= 0 ? node_x[k][found] : k == 0 ? 1.0f : 0.0f;
+                }
+            }
+            for (int l = 0; l < LANES; ++l) {
+                for (int k = 0; k < 6; ++k) at[k][going_on + l] = at[k][going_on - 1];
+            }
+            rows = at[0];
+        }
+        for (int start = 0; start < going_on; start += LANES) {
+            const float* row = rows + start;
+            const I asked = start + lanes() < going_on;
+            const I vertex = iload(numbers + start);
+            const V target = V{load(row), load(row + ROW), load(row + 2 * ROW)};
+            V x = V{load(row + BEST * ROW), load(row + (BEST + 1) * ROW), load(row + (BEST + 2) * ROW)};
+            V best = same(0.0f), p = same(0.0f), n = same(0.0f), step = same(0.0f);
+            F residual = F(1.0e30f), shrink = F(1.0f);
+            I going = asked, used = I(0);
+            bool resumed = round == ROUND_FEW;
+            if (resumed) {
+                best = x;
+                step = V{load(row + STEP * ROW), load(row + (STEP + 1) * ROW), load(row + (STEP + 2) * ROW)};
+                residual = load(row + RESIDUAL * ROW);
+                shrink = load(row + SHRINK * ROW);
+                used = iload(few_used + start);
+            }
+            I later = I(0);
+            for (;;) {
+                const Sample s = sample(x);
+                I better;
+                if (resumed) {
+                    // Where the search stood: it was the best so far, and its step is known where that was shortened.
+                    better = going & (shrink == 1.0f);
+                    p = s.p;
+                    n = s.n;
+                    resumed = false;
+                } else {
+                    const F here = measure(s, target).residual;
+                    better = going & (here < residual);
+                    best = vpick(better, x, best);
+                    p = vpick(better, s.p, p);
+                    n = vpick(better, s.n, n);
+                    residual = pick(better, here, residual);
+                    shrink = pick(better, F(1.0f), shrink * retry_shrink);
+                    used += 1;
+                    going &= ~(residual <= settings.tolerance) & (shrink >= shrink_min) & (used < settings.iterations);
+                    const unsigned left = bits(going);
+                    if (left == 0) break;
+                    if (round == ROUND_FIRST && __builtin_popcount(left) <= FEW) {
+                        later = going;
+                        break;
+                    }
+                }
+                step = vpick(better, newton_step(s, target), step);
+                x = vpick(going, step_on_cube(best, p, step, shrink), x);
+            }
+            if (bits(later)) {
+                const F each[KEPT] = {target.x, target.y, target.z, best.x, best.y, best.z, step.x, step.y, step.z,
+                    residual, shrink};
+                float lane[KEPT][LANES];
+                int count_of[LANES];
+                for (int k = 0; k < KEPT; ++k) store(lane[k], each[k]);
+                istore(count_of, used);
+                for (unsigned left = bits(later); left != 0; left &= left - 1) {
+                    const int l = __builtin_ctz(left);
+                    for (int k = 0; k < KEPT; ++k) few[k][few_count] = lane[k][l];
+                    few_used[few_count] = count_of[l];
+                    few_vertex[few_count++] = numbers[start + l];
+                }
+            }
+            I done = asked & ~later & (residual <= accepted), answer = I(converged);
+            I rest = asked & ~later & ~done;
+            if (bits(rest) && round != ROUND_COARSE) {
+                for (unsigned left = bits(rest); left != 0; left &= left - 1) {
+                    const int l = __builtin_ctz(left);
+                    for (int k = 0; k < 3; ++k) far[k][far_count] = row[k * ROW + l];
+                    far_vertex[far_count++] = numbers[start + l];
+                }
+            } else if (bits(rest)) {
+                // map_search.solve_vertex: what is not near a root.
+                const Sample s = sample(best);
+                const Law law = measure(s, target);
+                const I closing = s.mask < 0.5f, off = residual > map.accepted;
+                const I grazing = ~(fmin(law.cos_eye, law.cos_target) >= grazing_cos);
+                const I without = ipick(grazing, I(hidden), ipick(closing, I(unreflected), I(max_iterations)));
+                const I nothing = rest & off & ((without != max_iterations) | (residual > settings.accepted));
+                int as[LANES];
+                float lane[4][LANES];
+                istore(as, without);
+                store(lane[0], best.x); store(lane[1], best.y); store(lane[2], best.z); store(lane[3], residual);
+                for (unsigned left = bits(nothing); left != 0; left &= left - 1) {
+                    const int l = __builtin_ctz(left), i = numbers[start + l];
+                    status[i] = (unsigned char)as[l];
+                    out_vertex.residual.data[i] = lane[3][l];
+                    for (int k = 0; k < 3; ++k) seeds[3 * i + k] = lane[k][l];
+                    screen[4 * i] = screen[4 * i + 1] = screen[4 * i + 3] = 0.0f;
+                    screen[4 * i + 2] = -1.0f;
+                }
+                done |= rest & ~nothing;
+                answer = ipick(rest & ~closing, I(max_iterations), answer);
+            }
+            if (!bits(done)) continue;
+            const F reach = edge_reach(p, n, target, F(map.least_curvature));
+            settle(done, answer, vertex, best, residual, virtual_vertex(p, n, target), reach);
+        }
     }
-""",
+""".replace("COARSE_NODES", str(COARSE_NODES)),
         wide=True,
     )
 )
@@ -168,10 +306,12 @@ def search_block(
     shrink_min: float,
     accepted: float,
     estimate: float,
+    grazing_cos: float,
     converged: int,
     hidden: int,
+    unreflected: int,
+    max_iterations: int,
     out_vertex: VertexView,
-    out_left: wp.array(dtype=wp.uint8),
 ): ...
 
 
@@ -188,9 +328,8 @@ def search_blocks_kernel(
     camera: CameraView,
     settings: SearchSettings,
     warm: int,
-    # Outputs (seed: in and out, zero where none; per block, whether something is left for the plain kernel):
+    # Outputs (seed: in and out, zero where none):
     out_vertex: VertexView,
-    out_left: wp.array(dtype=wp.uint8),
 ):
     """One thread per block of vertices; as `reflector_map.search_kernel`."""
     search_block(
@@ -212,8 +351,10 @@ def search_blocks_kernel(
         SHRINK_MIN,
         ACCEPTED,
         ESTIMATE,
+        GRAZING_COS,
         CONVERGED,
         HIDDEN,
+        UNREFLECTED,
+        MAX_ITERATIONS,
         out_vertex,
-        out_left,
     )

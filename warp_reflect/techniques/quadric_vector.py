@@ -197,7 +197,8 @@ wp.set_module_options({"enable_backward": False})
         const F mean = 0.5f * (s11 + s22);
         const F apart = root(0.25f * (s11 - s22) * (s11 - s22) + s12 * s12);
         const F least_curvature = fmax(mean - apart, F(0.0f)) / n_length;
-        settle(done, own, best, best_angle, virtual_vertex(best, n, target), edge_reach(best, n, target, least_curvature));
+        const F reach = edge_reach(best, n, target, least_curvature);
+        settle(done, I(converged), own, best, best_angle, virtual_vertex(best, n, target), reach);
     }
 """
     )

@@ -19,7 +19,7 @@ import warp as wp
 
 from warp_reflect import vector
 from warp_reflect.bodies import weld
-from warp_reflect.launch import launch
+from warp_reflect.launch import launch, module_part
 from warp_reflect.layers import Camera, CameraView, GBuffer, MirrorPixels, ReflectionLayer, Reflector
 from warp_reflect.reflector_maps import ReflectorMap, ReflectorMapView
 from warp_reflect.scene import PartRange, Scene
@@ -42,10 +42,11 @@ if TYPE_CHECKING:
 wp.set_module_options({"enable_backward": False})
 
 SHEET_EVALUATIONS = 40  # of a search: where a sheet's curvature jumps at its border, steps have to be shortened
+PLAIN = module_part(__name__, "plain")  # what vector kernels do elsewhere
 HELD_MIN = 0.25  # of a mirror's area; where its sheets hold less, nearly all of it would be traced anyway
 
 
-@wp.kernel
+@wp.kernel(module=PLAIN)
 def search_kernel(
     first: int,
     # Scene:
@@ -97,11 +98,9 @@ def search(
     count = len(points)
     inputs = [points, *own, map.view, frame, camera, chosen, int(warm), out_vertex]
     if chosen.method != int(SEARCH_MIDPOINT) and vector.chosen(kernels, device):
-        left = wp.zeros(vector.block_count(count), dtype=wp.uint8, device=device)
-        vector.launch_blocks(map_vector.search_blocks_kernel, count, [*inputs, left], device, threads)
-        if not left.numpy().any():
-            return
-    launch(search_kernel, count, inputs, device, threads)
+        vector.launch_blocks(map_vector.search_blocks_kernel, count, inputs, device, threads)
+    else:
+        launch(search_kernel, count, inputs, device, threads)
 
 
 @wp.kernel
