@@ -24,10 +24,8 @@ TRAVERSAL = (
     RAYS
     + r"""
     const unsigned long long* tree = (const unsigned long long*)mesh_id;
-    const float* tree_boxes = (const float*)tree[1];
-    const int* tree_children = (const int*)tree[2];
-    const float* tree_corners = (const float*)tree[3];
-    const int* tree_faces = (const int*)tree[4];
+    const float* tree_nodes = (const float*)tree[1];
+    const float* tree_chunks = (const float*)tree[2];
     typedef int RowMask __attribute__((ext_vector_type(8)));
     typedef bool RowBits __attribute__((ext_vector_type(8)));
     typedef float Four __attribute__((ext_vector_type(4)));
@@ -133,7 +131,8 @@ TRAVERSAL = (
             struct Waiting { int child; float enter; } waiting[DEEPEST];
             int waiting_count = 0, node = 0;
             while (node >= 0) {
-                const float* boxes = tree_boxes + 48 * node;
+                const float* boxes = tree_nodes + 64 * node;
+                const int* children = (const int*)(boxes + 48);
                 auto row = [&](int k) -> Row { Row v; __builtin_memcpy(&v, boxes + k, sizeof(v)); return v; };
                 Row enter = Row(0.0f), leave = Row(3.0e38f);
                 meets(by_x, row(down_x ? 24 : 0), row(down_x ? 0 : 24), enter, leave);
@@ -145,28 +144,34 @@ TRAVERSAL = (
                 __builtin_memcpy(entered, &enter, sizeof(entered));
                 const int from = waiting_count;
                 for (; found != 0; found &= found - 1) {
-                    const int slot = __builtin_ctz(found);
+                    const int slot = __builtin_ctz(found), child = children[slot];
+                    if (child == 0) continue;
+                    // On its way while others are asked.
+                    const float* next = child > 0 ? tree_nodes + 64 * child : tree_chunks + 48 * ~child;
+                    __builtin_prefetch(next);
+                    __builtin_prefetch(next + 16);
+                    __builtin_prefetch(next + 32);
                     int place = waiting_count++;
                     for (; place > from && waiting[place - 1].enter < entered[slot]; --place) waiting[place] = waiting[place - 1];
-                    waiting[place] = Waiting{8 * node + slot, entered[slot]};
+                    waiting[place] = Waiting{64 * node + slot, entered[slot]};
                 }
                 node = -1;
                 while (waiting_count > 0) {
                     const Waiting next = waiting[--waiting_count];
                     if (next.enter >= far) continue;
-                    const int child = tree_children[next.child];
-                    if (child == 0) continue;
+                    const float* of = tree_nodes + next.child;
+                    const int child = ((const int*)of)[48];
                     I asked[GROUPS], any = I(0);
                     EACH_GROUP {
-                        asked[g] = mask[g] & box(ray[g], met[g].t, tree_boxes + 48 * (next.child >> 3) + (next.child & 7));
+                        asked[g] = mask[g] & box(ray[g], met[g].t, of);
                         any |= asked[g];
                     }
                     if (!bits(any)) continue;
                     if (child >= 0) { node = child; break; }
                     I changed = I(0);
                     for (int chunk = ~child;; ++chunk) {
-                        const float* corners = tree_corners + 36 * chunk;
-                        const int* faces = tree_faces + 8 * chunk;
+                        const float* corners = tree_chunks + 48 * chunk;
+                        const int* faces = (const int*)(corners + 36);
                         auto four = [&](int k) -> Four { Four v; __builtin_memcpy(&v, corners + k, sizeof(v)); return v; };
                         Four in = Four(0.0f), out = Four(3.0e38f);
                         auto side = [&](const Span& by, int axis, bool down) {

@@ -16,10 +16,13 @@ from warp_reflect.launch import FINITE_FLAGS, launch
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FINITE_FLAGS})
 
 WIDTH = 8  # children of a node
-BOX_FLOATS = 6 * WIDTH  # the least x of all children, the least y and z, the most x, y and z
-CHUNK = 4  # triangles that lie together
-CORNER_FLOATS = 9 * CHUNK  # x of the first corner of all of them, y, z, then the other corners
-FACE_INTS = 8  # four triangles (-1 none), 1 where the leaf goes on with the next chunk, three unused
+# 4 bytes each, on whole cache lines of 16: the least x of all children, the least y and z, the most x, y and z; the children.
+NODE_WORDS = 64
+# x of the first corner of four triangles that lie together, y, z, then the other corners; the triangles (-1 none); 1 where the
+# leaf goes on with the next chunk.
+CHUNK_WORDS = 48
+FACE_INTS = 8  # of a chunk while it is laid out: its last numbers
+LINE = 64  # bytes of a cache line
 FIT_SPLIT_MIN = 2048  # nodes and chunks; what one of them costs is a few dozen numbers copied
 
 
@@ -118,7 +121,8 @@ def lay_out_kernel(
     const wp::Mesh& mesh = *(const wp::Mesh*)mesh_id;
     const int node_count = sources.shape[0] / 8;
     if (element < node_count) {
-        float* box = out_boxes.data + 48 * element;
+        float* box = out_nodes.data + 64 * element;
+        __builtin_memcpy(box + 48, children.data + 8 * element, 32);
         for (int k = 0; k < 8; ++k) {
             const int source = sources.data[8 * element + k];
             // No child: a box inside out, which nothing meets. A root that is a leaf: nothing passes by it.
@@ -131,11 +135,13 @@ def lay_out_kernel(
         return;
     }
     const int chunk = element - node_count;
+    float* numbers = out_chunks.data + 48 * chunk;
+    __builtin_memcpy(numbers + 36, faces.data + 8 * chunk, 32);
     for (int k = 0; k < 4; ++k) {
         const int face = faces.data[8 * chunk + k];
         for (int corner = 0; corner < 3; ++corner)
             for (int axis = 0; axis < 3; ++axis)
-                out_corners.data[36 * chunk + 12 * corner + 4 * axis + k] =
+                numbers[12 * corner + 4 * axis + k] =
                     face < 0 ? 0.0f : mesh.points.data[mesh.indices.data[3 * face + corner]][axis];
     }
 """)
@@ -143,10 +149,11 @@ def lay_out_kernel(
 def fit_element(
     element: int,
     mesh_id: wp.uint64,
+    children: wp.array(dtype=int),
     sources: wp.array(dtype=int),
     faces: wp.array(dtype=int),
-    out_boxes: wp.array(dtype=float),
-    out_corners: wp.array(dtype=float),
+    out_nodes: wp.array(dtype=float),
+    out_chunks: wp.array(dtype=float),
 ): ...
 
 
@@ -154,13 +161,22 @@ def fit_element(
 def fit_kernel(
     first: int,
     mesh_id: wp.uint64,
+    children: wp.array(dtype=int),
     sources: wp.array(dtype=int),
     faces: wp.array(dtype=int),
-    out_boxes: wp.array(dtype=float),
-    out_corners: wp.array(dtype=float),
+    out_nodes: wp.array(dtype=float),
+    out_chunks: wp.array(dtype=float),
 ):
     """One thread per node, then one per chunk of triangles."""
-    fit_element(first + wp.tid(), mesh_id, sources, faces, out_boxes, out_corners)
+    fit_element(first + wp.tid(), mesh_id, children, sources, faces, out_nodes, out_chunks)
+
+
+def _lines(count: int) -> wp.array:
+    """Numbers that begin with a cache line."""
+    words = LINE // 4
+    held = wp.zeros(count + words, dtype=float, device="cpu")
+    first = -held.ptr % LINE // 4
+    return held[first : first + count]
 
 
 class WideTree:
@@ -176,19 +192,17 @@ class WideTree:
         none, counts = wp.zeros(0, dtype=int, device="cpu"), wp.zeros(2, dtype=int, device="cpu")
         launch(lay_out_kernel, 1, [wp.uint64(mesh.id), 0, counts, none, none, none], "cpu", 1)
         nodes, chunks = (int(count) for count in counts.numpy())
-        children, self._sources = (wp.empty(WIDTH * nodes, dtype=int, device="cpu") for _ in range(2))
+        self._children, self._sources = (wp.empty(WIDTH * nodes, dtype=int, device="cpu") for _ in range(2))
         self._faces = wp.zeros(FACE_INTS * chunks, dtype=int, device="cpu")
-        launch(lay_out_kernel, 1, [wp.uint64(mesh.id), 1, counts, children, self._sources, self._faces], "cpu", 1)
-        self._boxes = wp.empty(BOX_FLOATS * nodes, dtype=float, device="cpu")
-        self._corners = wp.empty(CORNER_FLOATS * chunks, dtype=float, device="cpu")
+        launch(lay_out_kernel, 1, [wp.uint64(mesh.id), 1, counts, self._children, self._sources, self._faces], "cpu", 1)
+        self._nodes, self._chunks = _lines(NODE_WORDS * nodes), _lines(CHUNK_WORDS * chunks)
         self._elements = nodes + chunks
-        arrays = (self._boxes, children, self._corners, self._faces)
-        self._children = children
-        self._header = wp.array([mesh.id, *(each.ptr for each in arrays)], dtype=wp.uint64, device="cpu")
+        self._header = wp.array([mesh.id, self._nodes.ptr, self._chunks.ptr], dtype=wp.uint64, device="cpu")
         self.id = self._header.ptr
         self.fit(threads)
 
     def fit(self, threads: int = 0) -> None:
         """Take over the boxes and points of the mesh, after it was refitted."""
-        inputs = [wp.uint64(self._mesh.id), self._sources, self._faces, self._boxes, self._corners]
+        laid_out = [self._children, self._sources, self._faces]
+        inputs = [wp.uint64(self._mesh.id), *laid_out, self._nodes, self._chunks]
         launch(fit_kernel, self._elements, inputs, "cpu", threads, split_min=FIT_SPLIT_MIN)
