@@ -344,6 +344,8 @@ def trace_pixels_kernel(
     i = first + wp.tid()
     if indexed != 0:
         i = index[i]
+        if i < 0:
+            return
     met = answered(known, out_triangle[i], out_u[i], out_v[i], out_distance[i])
     hit = trace_ray_from(mesh_id, scene, point[i], direction[i], normal[i], facets[pixel[i]], body, 0, 0.0, met)
     out_triangle[i] = hit.triangle
@@ -379,6 +381,8 @@ def retry_pixels_kernel(
     i = first + wp.tid()
     if indexed != 0:
         i = index[i]
+        if i < 0:
+            return
     if int(status[i]) != SKY:
         return
     again = int(0)
@@ -513,6 +517,8 @@ def trace_onward_kernel(
     i = first + wp.tid()
     if indexed != 0:
         i = index[i]
+        if i < 0:
+            return
     hit = trace_onward(mesh_id, scene, point[i], direction[i], normal[i], facet[i], int(inside[i]), 0.0)
     out_triangle[i] = hit.triangle
     out_u[i] = hit.u
@@ -672,13 +678,13 @@ def trace_pixels(
         layer: Receives triangle, u, v, distance and status (CONVERGED, SKY, STEP_LIMIT) of the pixels asked.
         part: The mirror itself, index into `scene.parts`.
         convex: The mirror's own triangles are stepped over.
-        index: int32, which of the pixels, each at most once; None: all.
+        index: int32, which of the pixels, each at most once, and -1 for none; None: all.
         threads: CPU threads; 0: one per core.
         kernels: `Settings.kernels`.
         meets_own: The mirror is met like anything else, but for the facet that a ray starts on.
 
     Returns:
-        The number of pixels asked.
+        The length of `index`, or the number of pixels.
     """
     count = pixels.count if index is None else len(index)
     if count == 0:
@@ -775,7 +781,7 @@ def trace_transmitted(
         facet: int32 [n], the triangle that each ray starts on.
         inside: uint8 [n], 1 where the ray is in the body of its facet.
         threads: CPU threads; 0: one per core.
-        index: int32, which of the rays, each at most once; None: all.
+        index: int32, which of the rays, each at most once, and -1 for none; None: all.
     """
     pixels = layer.pixels
     count = pixels.count if index is None else len(index)

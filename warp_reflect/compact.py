@@ -65,6 +65,22 @@ def padded(marks: wp.array, value: int) -> tuple[wp.array, wp.array]:
     return numbers, ends[len(ends) - 1 :]
 
 
+@wp.kernel
+def count_kernel(first: int, marks: wp.array(dtype=wp.uint8), value: int, out_count: wp.array(dtype=int)):
+    """One thread per element, on a device."""
+    if int(marks[first + wp.tid()]) == value:
+        wp.atomic_add(out_count, 0, 1)
+
+
+def counted(marks: wp.array, value: int) -> wp.array:
+    """How many elements of a uint8 array have a value, int32 [1]; few of many, or they queue on a device."""
+    if not stays(marks.device):
+        return wp.full(1, int(np.count_nonzero(marks.numpy() == value)), dtype=int, device=marks.device)
+    count = wp.zeros(1, dtype=int, device=marks.device)
+    launch(count_kernel, len(marks), [marks, value, count], marks.device)
+    return count
+
+
 def taken(array: wp.array, numbers: wp.array) -> wp.array:
     """The elements of an array with some numbers, in their order."""
     return wp.indexedarray(array, [numbers]).contiguous()

@@ -70,10 +70,15 @@ class Frame:
         self.timings = timings
         self._picture = picture
         self.kept = _kept(layers, previous)
-        self.statistics: dict = {}
         self.transmitted = transmitted or {}
-        for layer in (*layers.values(), *(each.layer for each in self.transmitted.values())):
-            add_statistics(self.statistics, layer.statistics)
+
+    @cached_property
+    def statistics(self) -> dict:
+        """See above; counted when first asked for."""
+        total: dict = {}
+        for layer in (*self.layers.values(), *(each.layer for each in self.transmitted.values())):
+            add_statistics(total, layer.statistics)
+        return total
 
     @property
     def spent_ms(self) -> float:

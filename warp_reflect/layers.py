@@ -6,6 +6,7 @@ The *eye frame* has world axes and its origin at the eye.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Mapping, MutableMapping
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
@@ -259,6 +260,41 @@ class Reflector:
     convex: bool
 
 
+class Statistics(MutableMapping):
+    """Counts by name. What a device knows is read from it when any of them is asked for, not before."""
+
+    def __init__(self, known: dict | None = None):
+        self._known = dict(known or {})
+        self._later: list[Callable[[], dict]] = []
+
+    def later(self, counted: Callable[[], dict]) -> None:
+        """Add what is to be counted when it is asked for."""
+        self._later.append(counted)
+
+    def _all(self) -> dict:
+        while self._later:
+            add_statistics(self._known, self._later.pop()())
+        return self._known
+
+    def __getitem__(self, name: str):
+        return self._all()[name]
+
+    def __setitem__(self, name: str, value) -> None:
+        self._known[name] = value
+
+    def __delitem__(self, name: str) -> None:
+        del self._all()[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._all())
+
+    def __len__(self) -> int:
+        return len(self._all())
+
+    def __repr__(self) -> str:
+        return repr(self._all())
+
+
 @dataclass
 class ReflectionLayer:
     """The common answer of every technique for the pixels of one reflector, in the order of its `MirrorPixels`.
@@ -286,7 +322,7 @@ class ReflectionLayer:
     v: wp.array
     distance: wp.array
     status: wp.array
-    statistics: dict = field(default_factory=dict)
+    statistics: Statistics | dict = field(default_factory=Statistics)
     timings: dict = field(default_factory=dict)
     history: object = None
     virtual: list = field(default_factory=list)
@@ -314,7 +350,7 @@ def meets(scene: Scene, layer: ReflectionLayer, patches: np.ndarray) -> bool:
     return bool((patches.take(met) & (triangle >= 0)).any())
 
 
-def add_statistics(total: dict, statistics: dict) -> None:
+def add_statistics(total: MutableMapping, statistics: Mapping) -> None:
     """Add a layer's statistics to a total: counts add up, bounds (names that end in `_px`) are the largest."""
     for name, value in statistics.items():
         total[name] = max(total.get(name, 0.0), value) if name.endswith("_px") else total.get(name, 0) + value

@@ -144,14 +144,14 @@ def _solved(scene: Scene, camera: Camera, drawn: Drawn) -> _Triangles:
     triangles = place.reshape(-1, 3)
     sides = drawn.straddling
     if sides is not None:
-        own = sides.corners
+        own, boundary, side_triangles, owners = sides.on_host()
         seen = screen[own, 2] >= 0.0  # the others are corners behind the mirror, which no triangle here uses
         there = np.zeros((len(own), 3))
         there[seen] = _unproject(camera, screen[own[seen]].astype(np.float64))
-        boundary = sides.boundary.astype(np.float64)
-        whole = np.concatenate([seen, np.ones(len(boundary), bool)])[sides.triangles].all(axis=1)
-        triangles = np.concatenate([triangles, sides.triangles[whole] + len(points)])
-        parents = np.concatenate([parents, drawn.mesh.host_parents[sides.owners[whole]]])
+        boundary = boundary.astype(np.float64)
+        whole = np.concatenate([seen, np.ones(len(boundary), bool)])[side_triangles].all(axis=1)
+        triangles = np.concatenate([triangles, side_triangles[whole] + len(points)])
+        parents = np.concatenate([parents, drawn.mesh.host_parents[owners[whole]]])
         points = np.concatenate([points, there, boundary])
         sources = np.concatenate([sources, drawn.mesh.points.numpy()[own].astype(np.float64), boundary + eye])
     return _Triangles(points, sources, triangles.astype(np.int32), parents, eye)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from warp_reflect import bvh, raster
+from warp_reflect import bvh, compact, raster
 from warp_reflect.launch import launch
 from warp_reflect.layers import (
     Camera,
@@ -44,6 +44,10 @@ CONVERGED = wp.constant(int(Status.CONVERGED))
 HIDDEN = wp.constant(int(Status.HIDDEN))
 MAX_ITERATIONS = wp.constant(int(Status.MAX_ITERATIONS))
 SKY = wp.constant(int(Status.SKY))
+DROPPED = raster.DROPPED
+# Of a triangle, by its corners.
+STRADDLING = wp.constant(1)
+FAILED = wp.constant(2)
 # Bisections of an edge at the hidden boundary: 1/4096 of its length, below a pixel, or, where refinement finds the exact
 # hit anyway, a candidate close enough to walk from.
 BOUNDARY_STEPS = {"off": 12, "exact": 5, "strict": 5}
@@ -66,7 +70,7 @@ def straddle_kernel(
     status: wp.array(dtype=wp.uint8),
     out_kind: wp.array(dtype=wp.uint8),
 ):
-    """One thread per triangle: 1 if it straddles the hidden boundary, 2 if a corner's search failed, else 0."""
+    """One thread per triangle: `STRADDLING` the hidden boundary, `FAILED` if a corner's search did, else 0."""
     i = first + wp.tid()
     t = triangles[i]
     hidden = int(0)
@@ -82,19 +86,111 @@ def straddle_kernel(
             failed += 1
     kind = int(0)
     if failed > 0:
-        kind = 2
+        kind = FAILED
     elif hidden > 0 and solved > 0:
-        kind = 1
+        kind = STRADDLING
     out_kind[i] = wp.uint8(kind)
 
 
 @wp.kernel
-def project_points_kernel(
-    first: int, points: wp.array(dtype=wp.vec3), camera: CameraView, out_screen: wp.array(dtype=wp.vec4)
+def turn_kernel(
+    first: int,
+    ids: wp.array(dtype=int),
+    triangles: wp.array(dtype=wp.vec3i),
+    status: wp.array(dtype=wp.uint8),
+    out_corners: wp.array(dtype=wp.vec3i),
+    out_edges: wp.array(dtype=wp.vec2i),
 ):
-    """One thread per eye-frame point."""
+    """One thread per straddling triangle: turned so that the corner unlike the other two comes first, and its two edges.
+
+    An edge is (visible vertex, vertex that is not); (-1, -1) where there is no triangle (id -1).
+    """
     i = first + wp.tid()
-    out_screen[i] = project(camera, points[i])
+    count = ids.shape[0]
+    if ids[i] < 0:
+        out_edges[i] = wp.vec2i(-1, -1)
+        out_edges[count + i] = wp.vec2i(-1, -1)
+        return
+    t = triangles[ids[i]]
+    visible = int(0)
+    for k in range(3):
+        if int(status[t[k]]) == CONVERGED:
+            visible += 1
+    odd = int(0)
+    for k in range(3):
+        if (int(status[t[k]]) == CONVERGED) == (visible == 1):
+            odd = k
+    a = t[odd]
+    b = t[(odd + 1) % 3]
+    c = t[(odd + 2) % 3]
+    out_corners[i] = wp.vec3i(a, b, c)
+    if visible == 1:
+        out_edges[i] = wp.vec2i(a, b)
+        out_edges[count + i] = wp.vec2i(a, c)
+    else:
+        out_edges[i] = wp.vec2i(b, a)
+        out_edges[count + i] = wp.vec2i(c, a)
+
+
+@wp.kernel
+def sides_kernel(
+    first: int,
+    ids: wp.array(dtype=int),
+    triangles: wp.array(dtype=wp.vec3i),
+    screen: wp.array(dtype=wp.vec4),
+    status: wp.array(dtype=wp.uint8),
+    corners: wp.array(dtype=wp.vec3i),
+    boundary: wp.array(dtype=wp.vec3),
+    camera: CameraView,
+    # Outputs:
+    out_screen: wp.array(dtype=wp.vec4),
+    out_triangles: wp.array(dtype=wp.vec3i),
+    out_owners: wp.array(dtype=int),
+    out_planes: wp.array(dtype=wp.vec3i),
+):
+    """One thread per straddling triangle: its visible side, one triangle or two; see `Straddling` for their points.
+
+    The last point has no picture: what is no triangle has it for its corners.
+    """
+    i = first + wp.tid()
+    n = ids.shape[0]
+    none = wp.vec3i(5 * n, 5 * n, 5 * n)
+    if i == 0:
+        out_screen[5 * n] = wp.vec4(0.0, 0.0, DROPPED, 0.0)
+    out_triangles[i] = none
+    out_triangles[n + i] = none
+    if ids[i] < 0:
+        return
+    corner = corners[i]
+    for k in range(3):
+        out_screen[k * n + i] = screen[corner[k]]
+    for k in range(2):
+        out_screen[(3 + k) * n + i] = project(camera, boundary[k * n + i])
+        out_owners[k * n + i] = ids[i]
+        out_planes[k * n + i] = triangles[ids[i]]
+    if int(status[corner[0]]) == CONVERGED:
+        out_triangles[i] = wp.vec3i(i, 3 * n + i, 4 * n + i)
+    else:
+        # The quadrilateral b, c, cut ca, cut ba.
+        out_triangles[i] = wp.vec3i(n + i, 2 * n + i, 4 * n + i)
+        out_triangles[n + i] = wp.vec3i(n + i, 4 * n + i, 3 * n + i)
+
+
+@wp.kernel
+def caution_kernel(
+    first: int,
+    drawn: wp.array(dtype=int),
+    dense: int,
+    failed: wp.array(dtype=int),
+    wary: int,
+    out_caution: wp.array(dtype=int),
+):
+    """One thread: see `refine.fixed_caution`; `drawn` in parts, `dense`: how many of them make wary."""
+    total = int(0)
+    for k in range(drawn.shape[0]):
+        total += drawn[k]
+    out_caution[0] = wp.where(failed[0] == 0, 1, 0)
+    out_caution[1] = wp.where(total > dense, 1, wary)
 
 
 @wp.func
@@ -261,9 +357,9 @@ def reflect(
             threads=settings.threads,
             kernels=settings.kernels,
         )
-        drawn = int(drawn.numpy().sum())
-        straddling, failed = _draw_straddling(scene, mesh, target, frame, vertices, solve_boundary, gbuffer, settings)
-        clipped = 0 if straddling is None else len(straddling.boundary) // 2
+        straddling, clipped, failed = _draw_straddling(
+            scene, mesh, target, frame, vertices, solve_boundary, gbuffer, settings
+        )
         layer.virtual = [Drawn(pixels, mesh, vertices.screen, straddling)]
     if settings.refine == "off":
         with timer("candidates"):
@@ -278,7 +374,7 @@ def reflect(
                 settings.threads,
             )
         layer.statistics.update(candidate=pixels.count)
-        doubtful = refine.in_doubt_of_holes(scene, layer)
+        doubtful = refine.in_doubt_of_holes(scene, layer, settings.threads)
         if doubtful is not None:
             bvh.trace_pixels(
                 scene,
@@ -296,8 +392,10 @@ def reflect(
             blocked = wp.zeros(0, dtype=wp.uint8, device=scene.device)
             if not reflector.convex:
                 blocked = bvh.own_obstacles(scene, gbuffer, pixels, reflector.part, settings.threads)
-        wary = wary or drawn > DENSE * pixels.count
         with timer("refine"):
+            caution = wp.empty(2, dtype=int, device=scene.device)
+            dense = int(DENSE * pixels.count)
+            launch(caution_kernel, 1, [drawn, dense, failed, int(wary), caution], scene.device)
             doubtful = refine.settle(
                 scene,
                 gbuffer,
@@ -307,9 +405,8 @@ def reflect(
                 layer,
                 blocked,
                 settings,
-                trust_sky=failed == 0,
-                wary=wary,
-                seen=scene.seen_in(part),
+                caution,
+                scene.seen_in(part),
             )
         with timer("trace"):
             bvh.trace_pixels(
@@ -323,7 +420,9 @@ def reflect(
                 settings.threads,
                 settings.kernels,
             )
-    layer.statistics.update(vertices=mesh.vertex_count, drawn=drawn, clipped=clipped, failed=failed)
+    counts = {"drawn": drawn, "clipped": clipped, "failed": failed}
+    layer.statistics.later(lambda: {name: int(count.numpy().sum()) for name, count in counts.items()})
+    layer.statistics.update(vertices=mesh.vertex_count)
     layer.timings = timer.ms
     return layer
 
@@ -370,55 +469,42 @@ def cut_where_bent(
 
 def _draw_straddling(
     scene, mesh, target, frame, vertices, solve_boundary, gbuffer, settings
-) -> tuple[Straddling | None, int]:
-    """Draw the visible side of triangles that straddle the hidden boundary; (they, triangles with a failed corner).
+) -> tuple[Straddling, wp.array, wp.array]:
+    """Draw the visible side of triangles that straddle the hidden boundary.
+
+    Returns:
+        (what was drawn; how many straddle it, int32 [1]; triangles with a failed corner, likewise).
 
     On the boundary the line of sight grazes the mirror, so the virtual point is the real one.
     """
-    count = len(mesh.triangles)
-    kind = wp.zeros(count, dtype=wp.uint8, device=scene.device)
-    launch(straddle_kernel, count, [mesh.triangles, vertices.status, kind], scene.device, settings.threads)
-    host_kind = kind.numpy()
-    failed = int((host_kind == 2).sum())
-    ids = np.flatnonzero(host_kind == 1)
-    if not len(ids):
-        return None, failed
-    corner = mesh.host_triangles[ids]
-    visible = vertices.status.numpy()[corner] == int(Status.CONVERGED)
-    # Turn each triangle so that the corner unlike the other two comes first.
-    single = visible.sum(axis=1) == 1
-    odd = np.where(single, visible.argmax(axis=1), (~visible).argmax(axis=1))
-    corner = np.take_along_axis(corner, (odd[:, None] + np.arange(3)) % 3, axis=1)
-    a, b, c = corner.T
-    edges = np.concatenate(
-        [
-            np.where(single[:, None], np.stack([a, b], 1), np.stack([b, a], 1)),
-            np.where(single[:, None], np.stack([a, c], 1), np.stack([c, a], 1)),
-        ]
-    ).astype(np.int32)
-    points = wp.empty(len(edges), dtype=wp.vec3, device=scene.device)
-    solve_boundary(mesh.points, frame, wp.array(edges, dtype=wp.vec2i, device=scene.device), points)
-    boundary = wp.empty(len(edges), dtype=wp.vec4, device=scene.device)
-    launch(project_points_kernel, len(edges), [points, gbuffer.view, boundary], scene.device, settings.threads)
-    cut_points = points.numpy()
-    known = vertices.screen.numpy()
+    count, device, threads = len(mesh.triangles), scene.device, settings.threads
+    kind = wp.zeros(count, dtype=wp.uint8, device=device)
+    launch(straddle_kernel, count, [mesh.triangles, vertices.status, kind], device, threads)
+    ids, clipped = compact.padded(kind, STRADDLING)
     n = len(ids)
-    cut = boundary.numpy()
-    # One visible corner: (a, cut ab, cut ac). Two: the quadrilateral b, c, cut ca, cut ba as two triangles.
-    screen = np.concatenate([known[a], known[b], known[c], cut[:n], cut[n:]]).astype(np.float32)
-    va, vb, vc, vab, vac = (np.arange(n) + k * n for k in range(5))
-    ones = np.stack([va, vab, vac], 1)[single]
-    twos = np.concatenate([np.stack([vb, vc, vac], 1)[~single], np.stack([vb, vac, vab], 1)[~single]])
-    triangles = np.concatenate([ones, twos]).astype(np.int32)
-    owners = np.concatenate([ids[single], ids[~single], ids[~single]]).astype(np.int32)
-    raster.rasterise(
-        target,
-        wp.array(screen, dtype=wp.vec4, device=scene.device),
-        wp.array(triangles, dtype=wp.vec3i, device=scene.device),
-        ids=wp.array(owners, dtype=int, device=scene.device),
-        points=mesh.points,
-        plane_triangles=wp.array(mesh.host_triangles[owners], dtype=wp.vec3i, device=scene.device),
-        threads=settings.threads,
-        kernels=settings.kernels,
+    sides = Straddling(
+        wp.zeros(n, dtype=wp.vec3i, device=device),
+        wp.empty(2 * n, dtype=wp.vec3, device=device),
+        wp.empty(2 * n, dtype=wp.vec3i, device=device),
+        wp.zeros(2 * n, dtype=int, device=device),
     )
-    return Straddling(np.concatenate([a, b, c]), cut_points, triangles, owners), failed
+    if n:
+        edges = wp.empty(2 * n, dtype=wp.vec2i, device=device)
+        launch(turn_kernel, n, [ids, mesh.triangles, vertices.status, sides.corners, edges], device, threads)
+        solve_boundary(mesh.points, frame, edges, sides.boundary)
+        screen = wp.empty(5 * n + 1, dtype=wp.vec4, device=device)
+        planes = wp.zeros(2 * n, dtype=wp.vec3i, device=device)
+        inputs = [ids, mesh.triangles, vertices.screen, vertices.status, sides.corners, sides.boundary, gbuffer.view]
+        outputs = [screen, sides.triangles, sides.owners, planes]
+        launch(sides_kernel, n, inputs + outputs, device, threads)
+        raster.rasterise(
+            target,
+            screen,
+            sides.triangles,
+            ids=sides.owners,
+            points=mesh.points,
+            plane_triangles=planes,
+            threads=threads,
+            kernels=settings.kernels,
+        )
+    return sides, clipped, compact.counted(kind, FAILED)

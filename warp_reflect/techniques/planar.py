@@ -79,6 +79,8 @@ def plane_crossing_kernel(
 ):
     """One thread per edge (visible vertex, vertex behind): where it meets the plane, eye frame."""
     i = first + wp.tid()
+    if edges[i][0] < 0:
+        return
     a = frame.unit_from_scene * points[edges[i][0]] + frame.unit_offset
     b = frame.unit_from_scene * points[edges[i][1]] + frame.unit_offset
     t = a[2] / (a[2] - b[2])

@@ -484,10 +484,9 @@ def reflect_branches(
         doubtful = covered[pixel // width - target.box[1], pixel % width - target.box[0]]
         blocked = wp.array(np.maximum(blocked.numpy(), doubtful).astype(np.uint8), dtype=wp.uint8, device=scene.device)
     with timer("refine"):
+        caution = refine.fixed_caution(False, False, scene.device)
         seen = scene.seen_in(part)
-        left = refine.settle(
-            scene, gbuffer, pixels, target, together, layer, blocked, settings, trust_sky=False, seen=seen
-        )
+        left = refine.settle(scene, gbuffer, pixels, target, together, layer, blocked, settings, caution, seen)
     with timer("trace"):
         how = {"threads": settings.threads, "kernels": settings.kernels}
         bvh.trace_pixels(scene, gbuffer, pixels, layer, reflector.part, reflector.convex, left, **how)

@@ -11,8 +11,8 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from warp_reflect import raster, vector
-from warp_reflect.launch import FINITE_FLAGS, launch
+from warp_reflect import compact, raster, vector
+from warp_reflect.launch import FINITE_FLAGS, launch, module_part
 from warp_reflect.layers import GBuffer, MirrorPixels, ReflectionLayer
 from warp_reflect.scene import Scene, SceneView
 from warp_reflect.settings import Settings, Status
@@ -21,6 +21,8 @@ from warp_reflect.techniques import refine_vector
 from warp_reflect.techniques.virtual_mesh import VirtualMesh
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FINITE_FLAGS})
+
+UNSURE = module_part(__name__, "unsure")
 
 CONVERGED = wp.constant(int(Status.CONVERGED))
 SKY = wp.constant(int(Status.SKY))
@@ -140,8 +142,8 @@ def settle_kernel(
     blocked: wp.array(dtype=wp.uint8),
     # Settings:
     hop_count: int,
-    trust_sky: int,
-    wary: int,
+    strict: int,
+    caution: wp.array(dtype=int),
     # Outputs:
     out_triangle: wp.array(dtype=int),
     out_u: wp.array(dtype=float),
@@ -160,6 +162,8 @@ def settle_kernel(
     x = pixel[i] - y * target.mask_width
     cell = (y - target.y0) * (target.x1 - target.x0) + x - target.x0
     key = target.key[cell]
+    trust_sky = caution[0]
+    wary = wp.max(caution[1], strict)
     inside = x > target.x0 and x + 1 < target.x1 and y > target.y0 and y + 1 < target.y1
     if key == wp.uint64(0):
         if trust_sky == 0:
@@ -264,17 +268,55 @@ def doubt_coarse(
         launch(coarse_kernel, len(point), [scene.view, *rays, settled], scene.device, settings.threads)
 
 
-def _on_cut(scene: Scene, layer: ReflectionLayer) -> np.ndarray:
-    """At which pixels a layer shows a triangle that may have holes, bool [pixels]; the scene has some."""
-    triangle = layer.triangle.numpy()
-    return (triangle >= 0) & scene.has_hole[np.maximum(triangle, 0)]
+@wp.kernel(module=UNSURE)
+def doubt_kernel(
+    first: int, triangle: wp.array(dtype=int), unsure: wp.array(dtype=wp.uint8), out_settled: wp.array(dtype=wp.uint8)
+):
+    """One thread per mirror pixel: in doubt where it shows a triangle that is not sure to be seen."""
+    i = first + wp.tid()
+    if triangle[i] >= 0:
+        if unsure[triangle[i]] != wp.uint8(0):
+            out_settled[i] = wp.uint8(DOUBT)
 
 
-def in_doubt_of_holes(scene: Scene, layer: ReflectionLayer) -> wp.array | None:
-    """int32 indices of the pixels that show a triangle that may have holes; None: no triangle of the scene has."""
+def doubt_unsure(
+    scene: Scene, seen: np.ndarray | None, layer: ReflectionLayer, settled: wp.array, threads: int
+) -> None:
+    """Set `settled` to DOUBT where a layer shows what may have holes, or what `Scene.seen_in` leaves out."""
+    if seen is None and scene.has_hole is None:
+        return
+    key = "unsure", None, id(seen)
+    if key not in scene.facts:
+        unsure = np.zeros(scene.triangle_count, np.uint8) if seen is None else ~seen
+        if scene.has_hole is not None:
+            unsure = unsure | scene.has_hole
+        # With what it was made from, which so keeps its id.
+        scene.facts[key] = seen, wp.array(unsure.astype(np.uint8), dtype=wp.uint8, device=scene.device)
+    launch(doubt_kernel, len(settled), [layer.triangle, scene.facts[key][1], settled], scene.device, threads)
+
+
+def in_doubt_of_holes(scene: Scene, layer: ReflectionLayer, threads: int) -> wp.array | None:
+    """The pixels that show a triangle that may have holes, see `compact.padded`; None: no triangle of the scene has."""
     if scene.has_hole is None:
         return None
-    return wp.array(np.flatnonzero(_on_cut(scene, layer)).astype(np.int32), dtype=int, device=scene.device)
+    settled = wp.full(layer.pixels.count, CANDIDATE, dtype=wp.uint8, device=scene.device)
+    doubt_unsure(scene, None, layer, settled, threads)
+    return compact.padded(settled, DOUBT)[0]
+
+
+def fixed_caution(trust_sky: bool, wary: bool, device) -> wp.array:
+    """How `settle` takes a picture, int32 [2].
+
+    Args:
+        trust_sky: No virtual triangle was dropped: an empty neighbourhood is sky.
+        wary: The picture may be off by a part of a pixel: every candidate of the neighbourhood is tested, and what none of
+            them is hit by directly is left to the BVH.
+    """
+    caution = wp.zeros(2, dtype=int, device=device)
+    for k, asked in enumerate((trust_sky, wary)):
+        if asked:
+            caution[k : k + 1].fill_(1)
+    return caution
 
 
 def settle(
@@ -286,8 +328,7 @@ def settle(
     layer: ReflectionLayer,
     blocked: wp.array,
     settings: Settings,
-    trust_sky: bool,
-    wary: bool = False,
+    caution: wp.array,
     seen: np.ndarray | None = None,
 ) -> wp.array:
     """Write the hits that a virtual picture settles into the layer.
@@ -297,17 +338,15 @@ def settle(
         mesh: What was drawn.
         layer: Receives triangle, u, v, distance, status of the settled pixels, and their counts.
         blocked: uint8 [pixels.count], 1 where the mirror's own body (which is not drawn) is in the way; length 0: nowhere.
-        trust_sky: No virtual triangle was dropped: an empty neighbourhood is sky.
-        wary: The picture may be off by a part of a pixel: every candidate of the neighbourhood is
-            tested, and what none of them is hit by directly is left to the BVH.
+        caution: From `fixed_caution`, or found out where the picture was drawn.
         seen: Which triangles of the scene the mirror may show, see `Scene.seen_in`: a walk may end on another.
 
     Returns:
-        int32 indices into `pixels` of what the BVH must decide.
+        Indices into `pixels` of what the BVH must decide, see `compact.padded`.
     """
     settled = wp.empty(pixels.count, dtype=wp.uint8, device=scene.device)
     picture = [mesh.parents, mesh.patches, pixels.pixel, pixels.point, pixels.direction, blocked]
-    how = [settings.walk_hops, int(trust_sky), int(wary or settings.refine == "strict")]
+    how = [settings.walk_hops, int(settings.refine == "strict"), caution]
     outputs = [layer.triangle, layer.u, layer.v, layer.distance, layer.status, settled]
     if vector.chosen(settings.kernels, scene.device):
         records = [target.view, scene.neighbours, scene.triangle_records]
@@ -319,16 +358,14 @@ def settle(
         launch(settle_kernel, pixels.count, inputs, scene.device, settings.threads)
     if mesh.coarse is not None and len(mesh.coarse):
         doubt_coarse(scene, mesh.coarse, pixels.point, pixels.direction, layer, settled, settings)
-    host = settled.numpy()
-    if seen is not None:
-        triangle = layer.triangle.numpy()
-        host = np.where((triangle >= 0) & ~seen[np.maximum(triangle, 0)], DOUBT, host)
-    if scene.has_hole is not None:
-        # Whether a hole is met there, and what is behind it, is for a ray to say.
-        host = np.where(_on_cut(scene, layer), DOUBT, host)
-    doubtful = np.flatnonzero(host == DOUBT).astype(np.int32)
-    counts = np.bincount(host, minlength=4)
-    layer.statistics.update(
-        candidate=int(counts[CANDIDATE]), walk=int(counts[WALK]), empty=int(counts[EMPTY]), bvh=len(doubtful)
-    )
-    return wp.array(doubtful, dtype=int, device=scene.device)
+    # Whether a hole is met, and what is behind it, is for a ray to say.
+    doubt_unsure(scene, seen, layer, settled, settings.threads)
+    layer.statistics.later(lambda: _counts(settled))
+    return compact.padded(settled, DOUBT)[0]
+
+
+def _counts(settled: wp.array) -> dict[str, int]:
+    """Pixels by who settled them."""
+    counts = np.bincount(settled.numpy(), minlength=4)
+    names = {"candidate": CANDIDATE, "walk": WALK, "empty": EMPTY, "bvh": DOUBT}
+    return {name: int(counts[who]) for name, who in names.items()}

@@ -115,6 +115,8 @@ def boundary_kernel(
 ):
     """One thread per edge (visible vertex, vertex that is not): the last visible point, eye frame."""
     i = first + wp.tid()
+    if edges[i][0] < 0:
+        return
     a = frame.unit_from_scene * points[edges[i][0]] + frame.unit_offset
     b = frame.unit_from_scene * points[edges[i][1]] + frame.unit_offset
     low = float(0.0)

@@ -20,7 +20,7 @@ import warp as wp
 
 from warp_reflect import bvh, raster, vector
 from warp_reflect.launch import launch
-from warp_reflect.layers import CameraView, GBuffer, ReflectionLayer, add_statistics, project
+from warp_reflect.layers import CameraView, GBuffer, ReflectionLayer, project
 from warp_reflect.scene import Scene
 from warp_reflect.settings import Settings
 from warp_reflect.techniques import planar, refine, refraction_vector
@@ -261,11 +261,10 @@ def follow(
         target, screen, mesh.triangles, points=mesh.points, threads=threads, kernels=settings.kernels
     )
     none = wp.empty(0, dtype=wp.uint8, device=device)
-    doubtful = refine.settle(
-        scene, gbuffer, layer.pixels, target, mesh, layer, none, settings, trust_sky=True, wary=False
-    )
+    caution = refine.fixed_caution(True, False, device)
+    doubtful = refine.settle(scene, gbuffer, layer.pixels, target, mesh, layer, none, settings, caution)
     bvh.trace_transmitted(scene, layer, facet, inside, threads, doubtful)
-    add_statistics(layer.statistics, {"drawn": int(drawn.numpy().sum()), "vertices": mesh.vertex_count})
+    layer.statistics.later(lambda: {"drawn": int(drawn.numpy().sum()), "vertices": mesh.vertex_count})
 
 
 def _cut_where_bent(scene: Scene, found: Under, screen: wp.array, seen_at, box, settings: Settings):

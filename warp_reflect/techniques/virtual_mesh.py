@@ -71,19 +71,29 @@ class VirtualMesh:
 
 @dataclass(frozen=True)
 class Straddling:
-    """The visible sides of triangles that cross the hidden boundary.
+    """The visible sides of n triangles that cross the hidden boundary.
+
+    Their points are, one after the other: the first corner of every triangle (the one unlike the other two), the second, the
+    third, where the edge from the first to the second meets the boundary, and where that to the third does.
 
     Attributes:
-        corners: int [k], vertices of the mesh: the first points.
-        boundary: float32 [m, 3], the points after those: on the boundary, where virtual and real point coincide; eye frame.
-        triangles: int32 [n, 3], into all of these points.
-        owners: int32 [n], the triangle of the mesh that each is a side of.
+        corners: vec3i [n], vertices of the mesh.
+        boundary: vec3 [2 n], where the edges meet the boundary, on which virtual and real point coincide; eye frame.
+        triangles: vec3i [2 n], into the points; 5 n where there is none.
+        owners: int32 [2 n], the triangle of the mesh that each is a side of.
     """
 
-    corners: np.ndarray
-    boundary: np.ndarray
-    triangles: np.ndarray
-    owners: np.ndarray
+    corners: wp.array
+    boundary: wp.array
+    triangles: wp.array
+    owners: wp.array
+
+    def on_host(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """(vertices of the mesh: the first points; the points after those; triangles into all of them; their owners)."""
+        triangles = self.triangles.numpy()
+        there = triangles[:, 0] < 5 * len(self.corners)
+        corners = self.corners.numpy().T.reshape(-1)
+        return corners, self.boundary.numpy(), triangles[there], self.owners.numpy()[there]
 
 
 @dataclass(frozen=True)
