@@ -52,3 +52,21 @@ def test_the_devices_way_shows_the_same_picture(host_copies, device):
         there = wr.render_frame(scene, plan)
     for channel in ("RGBA", "reflectedPoint", "status"):
         np.testing.assert_array_equal(there[channel], here[channel])
+
+
+# Stage, method, settings: reads and bytes of a warm frame at most, and bytes written.
+HELD = {
+    "traced": ("one_mirror", "reference", {}, 1, 64, 8),
+    "reflector map": ("one_mirror", "reflector_map", {}, 5, 100_000, 10_000),
+}
+
+
+@pytest.mark.parametrize("case", HELD)
+def test_a_warm_frame_copies_little(case, host_copies):
+    stage, method, settings, reads, bytes_read, bytes_written = HELD[case]
+    scene = wr.load_stage(ROOT / "usd_scenes" / f"{stage}.usda")
+    copies = host_copies.of_warm_frame(scene, SIZE, method, **settings)
+    found = host_copies.summary(copies)
+    assert sum(copy.kind == "read" for copy in copies) <= reads, found
+    assert host_copies.bytes_of(copies, "read") <= bytes_read, found
+    assert host_copies.bytes_of(copies, "write") <= bytes_written, found
