@@ -11,6 +11,7 @@ from warp_reflect.layers import Camera
 from warp_reflect.scene import CameraData, InstanceData, MaterialData, Scene, SceneData
 from warp_reflect.settings import Status
 from warp_reflect.techniques import virtual_mesh
+from warp_reflect.techniques.vertices import VERTEX_ARRAYS
 
 
 @pytest.fixture(scope="module")
@@ -83,6 +84,31 @@ def test_lattice_tiles_its_triangle():
     corner = weights[triangles] * [0.0, 1.0, 1.0]
     area = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     np.testing.assert_allclose(area[:, 0], 1 / 64)
+
+
+@pytest.mark.parametrize("method", ["quadric", "reflector_map"])
+def test_what_cutting_adds_is_taken_over_from_what_was_solved(ball_room, method, monkeypatch):
+    """Corners and middles keep their answers bit for bit; the others are where a search from nothing finds them."""
+    knobs = {"edge_px": 0.05, "reuse_px": 0.5}
+    history = next(iter(render(ball_room, method, **knobs).layers.values())).history
+    mesh, base = history.mesh, history.mesh.base_count
+    place, corners = mesh.added_place, ball_room.host_triangles[mesh.added_triangle]
+    weights = np.stack([1.0 - place.sum(1), place[:, 0], place[:, 1]], 1)
+    assert (weights.max(1) < 1.0).sum() > 300 and (np.sort(weights, 1)[:, 1] < 0.5).sum() > 100
+    for name in VERTEX_ARRAYS:
+        values = getattr(history.vertices, name).numpy()
+        for k in range(3):
+            at = np.flatnonzero(weights[:, k] == 1.0)
+            assert len(at) > 100
+            np.testing.assert_array_equal(values[base + at], values[corners[at, k]], err_msg=name)
+    monkeypatch.setattr(virtual_mesh, "start_middles", lambda *given: None)
+    monkeypatch.setattr(virtual_mesh, "start_added", lambda *given: None)
+    again = next(iter(render(ball_room, method, **knobs).layers.values())).history
+    np.testing.assert_array_equal(again.mesh.added_place, place)
+    status, anew = history.vertices.status.numpy(), again.vertices.status.numpy()
+    np.testing.assert_array_equal(status, anew)
+    there, from_nothing = (each.vertices.screen.numpy()[status == 1] for each in (history, again))
+    assert np.abs(there[:, :2] - from_nothing[:, :2]).max() < 0.02
 
 
 def test_statistics_count_every_mirror_pixel(ball_room):

@@ -341,7 +341,7 @@ def reflect(
         solve_vertices(mesh.points, True, frame, history is not None, vertices)
     with timer("tessellate"):
         mesh, vertices = cut_where_bent(
-            scene, part, mesh, vertices, frame, solve_vertices, solve_apart, unit_per_scene, camera, pixels, settings
+            scene, part, mesh, vertices, frame, solve_vertices, unit_per_scene, camera, pixels, settings
         )
         layer.history = History(mesh, vertices, camera.eye)
     with timer("virtual_raster"):
@@ -428,7 +428,7 @@ def reflect(
 
 
 def cut_where_bent(
-    scene, part, mesh, vertices, frame, solve_vertices, solve_apart, unit_per_scene, camera, pixels, settings
+    scene, part, mesh, vertices, frame, solve_vertices, unit_per_scene, camera, pixels, settings
 ) -> tuple[VirtualMesh, VertexView]:
     """Cut triangles whose picture would bend by more than `edge_px`; keep the mesh where it is fine enough."""
     if settings.edge_px == 0.0:
@@ -447,7 +447,11 @@ def cut_where_bent(
         return mesh, vertices
     estimated = cuts_for(1.0 / virtual_mesh.CUT_SLACK)
     ids = np.flatnonzero(estimated > 1)
-    middles = solve_apart(wp.array(virtual_mesh.edge_middles(scene, ids), dtype=wp.vec3, device=scene.device))
+    places = wp.array(virtual_mesh.edge_middles(scene, ids), dtype=wp.vec3, device=scene.device)
+    with_position = len(vertices.position) > 0
+    middles = empty_vertices(len(places), scene.device, with_position)
+    virtual_mesh.start_middles(scene, ids, vertices, middles, settings.threads)
+    solve_vertices(places, False, frame, True, middles)
     cuts, relaxed = np.ones(scene.triangle_count, np.uint8), 1.0
     for _ in range(virtual_mesh.RELAX_STEPS):
         allowed_px = settings.edge_px * relaxed / virtual_mesh.CUT_SLACK
@@ -460,10 +464,12 @@ def cut_where_bent(
     coarse = virtual_mesh.coarse_triangles(scene, part, vertices, ids, middles, cuts, unit_per_scene)
     finer.coarse = wp.array(coarse, dtype=int, device=scene.device)
     base = mesh.base_count
-    known = empty_vertices(finer.vertex_count, scene.device, with_position=len(vertices.position) > 0)
+    known = empty_vertices(finer.vertex_count, scene.device, with_position)
     copy_vertices(known, vertices, base)
     if finer.vertex_count > base:  # as measured, nothing may be left to cut
-        solve_vertices(finer.points[base:], False, frame, False, vertices_from(known, base))
+        added = vertices_from(known, base)
+        virtual_mesh.start_added(scene, finer, ids, vertices, middles, added, settings.threads)
+        solve_vertices(finer.points[base:], False, frame, True, added)
     return finer, known
 
 

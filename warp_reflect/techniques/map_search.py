@@ -398,9 +398,9 @@ def solve_vertex(
     if not is_visible(map, frame.eye, target):
         out_vertex.status[i] = wp.uint8(HIDDEN)
         return
-    seed = warm_seed
-    if max_abs(seed) == 0.0:
-        seed = first_guess(map, frame.eye, target)
+    seed = first_guess(map, frame.eye, target)
+    if max_abs(warm_seed) > 0.0:
+        seed = project_to_cube(warm_seed)
     r = search(map, frame.eye, target, seed, settings)
     out_vertex.seed[i] = r.x
     out_vertex.residual[i] = r.residual

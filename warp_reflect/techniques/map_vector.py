@@ -93,6 +93,7 @@ wp.set_module_options({"enable_backward": False})
         V seed = same(0.0f);
         if (warm != 0) seed = vgather(seeds, own);
         const I unknown = size(seed) == 0.0f;
+        seed = project_to_cube(seed);
         if (bits(asked & unknown)) {
             // map_search.first_guess
             const F height = fmax(length(white) - 1.0f, F(1.0e-3f));

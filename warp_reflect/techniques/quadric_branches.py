@@ -421,9 +421,8 @@ def reflect_branches(
                 copy_vertices(out_vertex, solve(points, has_own)[k], len(points))
 
             mesh, vertices = forward.cut_where_bent(
-                scene, part, whole, vertices, frame, solve_into, lambda points, k=k: solve(points, False)[k],
-                unit_per_scene, camera, pixels, settings,
-            )  # fmt: skip
+                scene, part, whole, vertices, frame, solve_into, unit_per_scene, camera, pixels, settings
+            )
             _follow(mesh, vertices, k, follow)
             finer = _cut_at_folds(scene, part, mesh, vertices)
             if finer is not mesh:

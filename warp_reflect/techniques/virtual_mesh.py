@@ -17,6 +17,7 @@ from warp_reflect.launch import launch
 from warp_reflect.layers import MirrorPixels
 from warp_reflect.scene import PartRange, Scene
 from warp_reflect.settings import Status
+from warp_reflect.techniques.vertices import VertexView
 
 wp.set_module_options({"enable_backward": False})
 
@@ -51,6 +52,8 @@ class VirtualMesh:
         estimated: uint8 [scene triangle_count], pieces along an edge by the estimate that was in force, 1 where whole.
         relaxed: Multiple of the tolerance asked that it was made for, 1 unless the budget was short.
         coarse: int32 [k], scene triangles whose picture is not whole, see `coarse_triangles`.
+        added_triangle: int32 [vertex_count - base_count], the scene triangle that each further vertex lies in; None: none do.
+        added_place: float32 [vertex_count - base_count, 2], and its weights of the second and the third corner.
     """
 
     points: wp.array
@@ -63,6 +66,8 @@ class VirtualMesh:
     estimated: np.ndarray
     relaxed: float
     coarse: wp.array | None = None
+    added_triangle: np.ndarray | None = None
+    added_place: np.ndarray | None = None
 
     @property
     def vertex_count(self) -> int:
@@ -293,6 +298,7 @@ def cut_mesh(scene: Scene, part: PartRange, cuts: np.ndarray, estimated: np.ndar
     cuts = np.where(dropped, 1, cuts)
     kept = (cuts == 1) & ~dropped
     points, triangles, parents = [scene.host_points], [scene.host_triangles[kept]], [np.flatnonzero(kept)]
+    added, places = [np.zeros(0, np.int32)], [np.zeros((0, 2), np.float32)]
     count = scene.vertex_count
     for pieces in np.unique(cuts[cuts > 1]):
         ids = np.flatnonzero(cuts == pieces)
@@ -303,6 +309,8 @@ def cut_mesh(scene: Scene, part: PartRange, cuts: np.ndarray, estimated: np.ndar
         first = count + np.arange(len(ids)) * len(weights)
         triangles.append((lattice[None] + first[:, None, None]).reshape(-1, 3))
         parents.append(np.repeat(ids, len(lattice)))
+        added.append(np.repeat(ids.astype(np.int32), len(weights)))
+        places.append(np.tile(weights[:, 1:].astype(np.float32), (len(ids), 1)))
         count += len(ids) * len(weights)
     host_triangles = np.concatenate(triangles).astype(np.int32)
     host_parents = np.concatenate(parents).astype(np.int32)
@@ -317,7 +325,129 @@ def cut_mesh(scene: Scene, part: PartRange, cuts: np.ndarray, estimated: np.ndar
         scene.vertex_count,
         estimated,
         relaxed,
+        added_triangle=np.concatenate(added),
+        added_place=np.concatenate(places),
     )
+
+
+@wp.func
+def known_seed(vertices: VertexView, i: int) -> wp.vec3:
+    """What a search from vertex i would start from; zero where it has no picture."""
+    if int(vertices.status[i]) != CONVERGED:
+        return wp.vec3(0.0, 0.0, 0.0)
+    return vertices.seed[i]
+
+
+@wp.kernel
+def start_middles_kernel(
+    first: int,
+    triangles: wp.array(dtype=wp.vec3i),
+    ids: wp.array(dtype=int),
+    vertices: VertexView,
+    out_middle: VertexView,
+):
+    """One thread per edge of `edge_middles`: searches start between what the edge's ends have found."""
+    i = first + wp.tid()
+    t = triangles[ids[i % ids.shape[0]]]
+    edge = i / ids.shape[0]
+    a = t[edge]
+    b = t[(edge + 1) % 3]
+    at_a = known_seed(vertices, a)
+    at_b = known_seed(vertices, b)
+    if wp.length_sq(at_a) > 0.0 and wp.length_sq(at_b) > 0.0:
+        out_middle.seed[i] = 0.5 * (at_a + at_b)
+
+
+@wp.func
+def copy_answer(source: VertexView, i: int, j: int, out_vertex: VertexView):
+    """Entry i of the source into entry j."""
+    out_vertex.screen[j] = source.screen[i]
+    out_vertex.status[j] = source.status[i]
+    out_vertex.residual[j] = source.residual[i]
+    out_vertex.reach[j] = source.reach[i]
+    out_vertex.seed[j] = source.seed[i]
+    if out_vertex.position.shape[0] > 0:
+        out_vertex.position[j] = source.position[i]
+        out_vertex.drift[j] = source.drift[i]
+
+
+@wp.kernel
+def start_added_kernel(
+    first: int,
+    triangles: wp.array(dtype=wp.vec3i),
+    ids: wp.array(dtype=int),
+    slot: wp.array(dtype=int),
+    place: wp.array(dtype=wp.vec2),
+    vertices: VertexView,
+    middles: VertexView,
+    out_added: VertexView,
+):
+    """One thread per added vertex: corners and middles of edges are known, other searches start between these."""
+    i = first + wp.tid()
+    k = slot[i]
+    t = triangles[ids[k]]
+    b = place[i][0]
+    c = place[i][1]
+    a = 1.0 - b - c
+    for corner in range(3):
+        weight = wp.where(corner == 0, a, wp.where(corner == 1, b, c))
+        if weight == 1.0:
+            copy_answer(vertices, t[corner], i, out_added)
+            return
+        if weight == 0.0 and wp.max(a, wp.max(b, c)) == 0.5:
+            # The middle of the edge across from this corner.
+            copy_answer(middles, ((corner + 1) % 3) * ids.shape[0] + k, i, out_added)
+            return
+    # Quadratic in the triangle: corners and middles.
+    count = ids.shape[0]
+    missing = int(0)
+    total = wp.vec3(0.0, 0.0, 0.0)
+    for corner in range(3):
+        weight = wp.where(corner == 0, a, wp.where(corner == 1, b, c))
+        onward = wp.where(corner == 0, b, wp.where(corner == 1, c, a))
+        at_corner = known_seed(vertices, t[corner])
+        at_middle = known_seed(middles, corner * count + k)
+        if wp.length_sq(at_corner) == 0.0 or wp.length_sq(at_middle) == 0.0:
+            missing = 1
+        total += weight * (2.0 * weight - 1.0) * at_corner + 4.0 * weight * onward * at_middle
+    if missing == 0:
+        out_added.seed[i] = total
+
+
+def start_middles(scene: Scene, ids: np.ndarray, vertices: VertexView, out_middle: VertexView, threads: int) -> None:
+    """Have the searches of `edge_middles` start between the answers of their edges' ends.
+
+    Args:
+        ids: Scene triangles asked.
+        vertices: Solved vertices of the scene.
+        out_middle: Empty.
+    """
+    listed = wp.array(ids.astype(np.int32), dtype=int, device=scene.device)
+    inputs = [scene.view.triangles, listed, vertices, out_middle]
+    launch(start_middles_kernel, 3 * len(ids), inputs, scene.device, threads)
+
+
+def start_added(
+    scene: Scene,
+    mesh: VirtualMesh,
+    ids: np.ndarray,
+    vertices: VertexView,
+    middles: VertexView,
+    out_added: VertexView,
+    threads: int,
+) -> None:
+    """Take over what is known of the vertices that cutting added, and have other searches start between known answers.
+
+    Args:
+        ids: Scene triangles whose `middles` are given, ascending; those that were cut are among them.
+        vertices, middles: Solved vertices of the scene, and of `edge_middles`.
+        out_added: Empty; one entry per added vertex.
+    """
+    device = scene.device
+    inputs = [scene.view.triangles, wp.array(ids.astype(np.int32), dtype=int, device=device)]
+    inputs.append(wp.array(np.searchsorted(ids, mesh.added_triangle).astype(np.int32), dtype=int, device=device))
+    inputs += [wp.array(mesh.added_place, dtype=wp.vec2, device=device), vertices, middles, out_added]
+    launch(start_added_kernel, len(mesh.added_triangle), inputs, device, threads)
 
 
 @cache
