@@ -265,9 +265,9 @@ class Statistics(MutableMapping):
 
     def __init__(self, known: dict | None = None):
         self._known = dict(known or {})
-        self._later: list[Callable[[], dict]] = []
+        self._later: list[Callable[[], Mapping]] = []
 
-    def later(self, counted: Callable[[], dict]) -> None:
+    def later(self, counted: Callable[[], Mapping]) -> None:
         """Add what is to be counted when it is asked for."""
         self._later.append(counted)
 
@@ -352,5 +352,8 @@ def meets(scene: Scene, layer: ReflectionLayer, patches: np.ndarray) -> bool:
 
 def add_statistics(total: MutableMapping, statistics: Mapping) -> None:
     """Add a layer's statistics to a total: counts add up, bounds (names that end in `_px`) are the largest."""
+    if isinstance(total, Statistics):
+        total.later(lambda: statistics)
+        return
     for name, value in statistics.items():
         total[name] = max(total.get(name, 0.0), value) if name.endswith("_px") else total.get(name, 0) + value

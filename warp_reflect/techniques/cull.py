@@ -23,9 +23,6 @@ from warp_reflect.techniques.vertices import VertexView
 WORTH = 128
 # Corners solved per vertex of the scene at most: beyond it the boxes cost more than they can save.
 CORNER_SHARE = 0.1
-# An edge's picture bends by (length / reach)^2 radians where the estimate holds; it is trusted up to here, twice over.
-BEND_MAX = 0.1
-BEND_SLACK = 2.0
 
 
 def settle_culled(
@@ -35,7 +32,7 @@ def settle_culled(
     camera: Camera,
     unit_per_scene: float,
     out_vertex: VertexView,
-) -> int:
+) -> Callable[[], int]:
     """Settle the vertices of objects that the mirror cannot show as `Status.UNREFLECTED`.
 
     Args:
@@ -45,18 +42,19 @@ def settle_culled(
         out_vertex: The scene's own vertices come first.
 
     Returns:
-        How many vertices.
+        How many vertices, counted when it is called.
     """
     first, count, corners = (values[scene.boxes[1] >= WORTH] for values in scene.boxes)
     if not 0 < 8 * len(first) <= CORNER_SHARE * scene.vertex_count:
-        return 0
-    solved = solve(wp.array(corners.reshape(-1, 3).astype(np.float32), dtype=wp.vec3, device=scene.device))
-    status = solved.status.numpy().reshape(-1, 8)
-    hidden = (status == int(Status.HIDDEN)).all(axis=1)
-    gone = np.flatnonzero(hidden | _beside(solved, status, corners, pixels, camera, unit_per_scene))
-    for k in gone:
-        _settle(int(first[k]), int(count[k]), out_vertex)
-    return int(count[gone].sum())
+        return lambda: 0
+    key = "boxes", None
+    if key not in scene.facts:
+        numbers = (wp.array(each.astype(np.int32), dtype=int, device=scene.device) for each in (first, count))
+        places = wp.array(corners.reshape(-1, 3).astype(np.float32), dtype=wp.vec3, device=scene.device)
+        scene.facts[key] = *numbers, places
+    boxes, focal = scene.facts[key], max(camera.fx, camera.fy)
+    gone = virtual_mesh.settle_gone(boxes, solve(boxes[2]), unit_per_scene, focal, pixels.box, out_vertex)
+    return lambda: int(count[gone.numpy() == 1].sum())
 
 
 def settle_unseen(scene: Scene, mirror: PartRange, out_vertex: VertexView) -> None:
@@ -71,19 +69,3 @@ def _settle(first: int, count: int, out_vertex: VertexView) -> None:
     members = slice(first, first + count)
     out_vertex.status[members].fill_(int(Status.UNREFLECTED))
     out_vertex.screen[members].fill_(wp.vec4(0.0, 0.0, raster.DROPPED, 0.0))
-
-
-def _beside(solved, status, corners, pixels, camera, unit_per_scene) -> np.ndarray:
-    """Boxes whose picture lies outside the mirror's pixels by more than its edges can bend."""
-    screen = solved.screen.numpy().reshape(-1, 8, 4).astype(np.float64)
-    reach = solved.reach.numpy().reshape(-1, 8).astype(np.float64)
-    diagonal = np.linalg.norm(corners[:, 7] - corners[:, 0], axis=1) * unit_per_scene
-    least = np.where(reach > 0.0, reach, np.inf).min(axis=1)
-    bend = (diagonal / least) ** 2
-    seen = (status == int(Status.CONVERGED)).all(axis=1) & (screen[..., 2] > 0.0).all(axis=1) & (bend < BEND_MAX)
-    margin = float(virtual_mesh.BOX_MARGIN) + BEND_SLACK * bend * max(camera.fx, camera.fy)
-    low, high = screen[..., :2].min(axis=1), screen[..., :2].max(axis=1)
-    x0, y0, x1, y1 = pixels.box
-    outside = (high[:, 0] + margin < x0) | (low[:, 0] - margin > x1)
-    outside |= (high[:, 1] + margin < y0) | (low[:, 1] - margin > y1)
-    return seen & outside

@@ -335,9 +335,8 @@ def reflect(
             layer.statistics.update(reused=reused, reused_px=reused_px)
         cull.settle_unseen(scene, part, vertices)
         if reflector.convex:
-            layer.statistics["culled"] = cull.settle_culled(
-                scene, solve_apart, pixels, camera, unit_per_scene, vertices
-            )
+            culled = cull.settle_culled(scene, solve_apart, pixels, camera, unit_per_scene, vertices)
+            layer.statistics.later(lambda: {"culled": culled()})
         solve_vertices(mesh.points, True, frame, history is not None, vertices)
     with timer("tessellate"):
         mesh, vertices = cut_where_bent(
@@ -435,15 +434,16 @@ def cut_where_bent(
         return mesh, vertices
     tolerance = settings.edge_px / max(camera.fx, camera.fy)
 
+    def needed(multiple: float) -> wp.array:
+        allowed = tolerance * multiple
+        return virtual_mesh.needed_cuts(scene, vertices, unit_per_scene, allowed, pixels.box, settings.threads)
+
     def cuts_for(multiple: float) -> np.ndarray:
-        cuts = virtual_mesh.needed_cuts(
-            scene, vertices, unit_per_scene, tolerance * multiple, pixels.box, settings.threads
-        )
+        cuts = needed(multiple).numpy()
         cuts[part.first_triangle : part.first_triangle + part.triangle_count] = 1
         return cuts
 
-    late = np.count_nonzero(cuts_for(mesh.relaxed) > mesh.estimated)
-    if late <= virtual_mesh.LATE_SHARE * np.count_nonzero(mesh.estimated > 1):
+    if not virtual_mesh.is_late(part, mesh, needed(mesh.relaxed), settings.threads):
         return mesh, vertices
     estimated = cuts_for(1.0 / virtual_mesh.CUT_SLACK)
     ids = np.flatnonzero(estimated > 1)

@@ -8,12 +8,13 @@ and Rappoport 1998 leave open). Neighbours may be cut differently; the gaps alon
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 import warp as wp
 
-from warp_reflect.launch import launch
+from warp_reflect import compact, raster
+from warp_reflect.launch import launch, stays
 from warp_reflect.layers import MirrorPixels
 from warp_reflect.scene import PartRange, Scene
 from warp_reflect.settings import Status
@@ -22,6 +23,9 @@ from warp_reflect.techniques.vertices import VertexView
 wp.set_module_options({"enable_backward": False})
 
 CONVERGED = wp.constant(int(Status.CONVERGED))
+HIDDEN = wp.constant(int(Status.HIDDEN))
+UNREFLECTED = wp.constant(int(Status.UNREFLECTED))
+DROPPED = raster.DROPPED
 CUT_MAX = wp.constant(32)  # pieces along an edge; a lattice of 32 has 1024 triangles
 STRADDLING_MAX = 4  # pieces of a triangle that is partly hidden: the estimate grows without bound at grazing incidence
 CUT_SLACK = 1.5  # the tolerance is divided by it when cutting, so that a moving eye does not cut anew every frame
@@ -33,11 +37,15 @@ BUDGET_MIN = 20000
 RELAX = 2.0  # factor of the tolerance per attempt to meet the budget
 RELAX_STEPS = 24  # 2^23 times the tolerance cuts nothing any more
 MEASURED_LENGTH = 2.0  # of a mirror's radius: the deviation of longer pieces says nothing about that of shorter ones
+GONE_LANES = 64  # threads of a device for each box whose vertices are settled together
 # Of the mirror's radius: longer pieces of a partly hidden triangle end in a straight line where the border of what is hidden
 # is curved, and what lies between is not drawn. Such triangles are asked for at every pixel (`refine.settle`).
 COARSE_SHARE = 1.0
 COARSE_MAX = 48  # of them at most, the largest first: a test costs 10 ns a pixel, a ray a few hundred
 BOX_MARGIN = wp.constant(8.0)  # pixels around a virtual triangle's straight picture that its bent one may reach
+# An edge's picture bends by (length / reach)^2 radians where the estimate holds; it is trusted up to here, twice over.
+BEND_MAX = wp.constant(0.1)
+BEND_SLACK = wp.constant(2.0)
 
 
 @dataclass
@@ -72,6 +80,16 @@ class VirtualMesh:
     @property
     def vertex_count(self) -> int:
         return len(self.points)
+
+    @cached_property
+    def estimated_there(self) -> wp.array:
+        """`estimated` on the device."""
+        return wp.array(self.estimated, dtype=wp.uint8, device=self.points.device)
+
+    @cached_property
+    def late_most(self) -> float:
+        """Triangles that may want more pieces before everything is cut anew."""
+        return LATE_SHARE * np.count_nonzero(self.estimated > 1)
 
 
 @dataclass(frozen=True)
@@ -174,7 +192,30 @@ def cut_kernel(
     out_cut[i] = wp.uint8(pieces)
 
 
-def needed_cuts(scene: Scene, vertices, unit_per_scene: float, tolerance: float, box, threads: int) -> np.ndarray:
+@wp.kernel
+def late_kernel(
+    first: int,
+    cut: wp.array(dtype=wp.uint8),
+    estimated: wp.array(dtype=wp.uint8),
+    own_first: int,
+    own_count: int,
+    out_late: wp.array(dtype=wp.uint8),
+):
+    """One thread per scene triangle: 1 where it wants more pieces than were estimated, and is not the mirror's own."""
+    i = first + wp.tid()
+    late = cut[i] > estimated[i] and (i < own_first or i >= own_first + own_count)
+    out_late[i] = wp.uint8(wp.where(late, 1, 0))
+
+
+def is_late(part: PartRange, mesh: VirtualMesh, cut: wp.array, threads: int) -> bool:
+    """Whether too many triangles want more pieces (`needed_cuts`) than a mesh was made for."""
+    late = wp.empty(len(cut), dtype=wp.uint8, device=cut.device)
+    own = [part.first_triangle, part.triangle_count]
+    launch(late_kernel, len(cut), [cut, mesh.estimated_there, *own, late], cut.device, threads)
+    return int(compact.counted(late, 1).numpy()[0]) > mesh.late_most
+
+
+def needed_cuts(scene: Scene, vertices, unit_per_scene: float, tolerance: float, box, threads: int) -> wp.array:
     """Pieces per scene triangle, uint8 [triangle_count].
 
     Args:
@@ -185,7 +226,112 @@ def needed_cuts(scene: Scene, vertices, unit_per_scene: float, tolerance: float,
     inputs += [unit_per_scene, float(np.sqrt(tolerance))]
     inputs += [wp.vec4(*(float(side) for side in box)), cut]
     launch(cut_kernel, scene.triangle_count, inputs, scene.device, threads)
-    return cut.numpy()
+    return cut
+
+
+@wp.kernel
+def gone_kernel(
+    first: int,
+    corners: wp.array(dtype=wp.vec3),
+    status: wp.array(dtype=wp.uint8),
+    screen: wp.array(dtype=wp.vec4),
+    reach: wp.array(dtype=float),
+    unit_per_scene: float,
+    focal: float,
+    pixels: wp.vec4,
+    out_gone: wp.array(dtype=wp.uint8),
+):
+    """One thread per box of eight solved corners: 1 if all are hidden, or all appear beside the pixels, bent edges included."""
+    i = first + wp.tid()
+    at = 8 * i
+    hidden = int(0)
+    seen = int(0)
+    least = float(1.0e30)
+    left = float(1.0e30)
+    right = float(-1.0e30)
+    top = float(1.0e30)
+    bottom = float(-1.0e30)
+    for k in range(8):
+        s = int(status[at + k])
+        p = screen[at + k]
+        if s == HIDDEN:
+            hidden += 1
+        elif s == CONVERGED and p[2] > 0.0:
+            seen += 1
+        if reach[at + k] > 0.0:
+            least = wp.min(least, reach[at + k])
+        left = wp.min(left, p[0])
+        right = wp.max(right, p[0])
+        top = wp.min(top, p[1])
+        bottom = wp.max(bottom, p[1])
+    gone = hidden == 8
+    if seen == 8:
+        across = wp.length(corners[at + 7] - corners[at]) * unit_per_scene / least
+        bend = across * across
+        margin = BOX_MARGIN + BEND_SLACK * bend * focal
+        beside = (
+            right + margin < pixels[0]
+            or left - margin > pixels[2]
+            or bottom + margin < pixels[1]
+            or top - margin > pixels[3]
+        )
+        gone = bend < BEND_MAX and beside
+    out_gone[i] = wp.uint8(wp.where(gone, 1, 0))
+
+
+@wp.kernel
+def settle_gone_kernel(
+    first: int,
+    gone: wp.array(dtype=wp.uint8),
+    first_vertex: wp.array(dtype=int),
+    vertex_count: wp.array(dtype=int),
+    lanes: int,
+    out_status: wp.array(dtype=wp.uint8),
+    out_screen: wp.array(dtype=wp.vec4),
+):
+    """`lanes` threads per box, which share its vertices."""
+    i = first + wp.tid()
+    box = i // lanes
+    if gone[box] == wp.uint8(0):
+        return
+    v = first_vertex[box] + i - box * lanes
+    end = first_vertex[box] + vertex_count[box]
+    while v < end:
+        out_status[v] = wp.uint8(UNREFLECTED)
+        out_screen[v] = wp.vec4(0.0, 0.0, DROPPED, 0.0)
+        v += lanes
+
+
+def settle_gone(
+    boxes: tuple[wp.array, wp.array, wp.array],
+    solved: VertexView,
+    unit_per_scene: float,
+    focal: float,
+    pixels: tuple[int, int, int, int],
+    out_vertex: VertexView,
+) -> wp.array:
+    """Settle the vertices of boxes that a mirror cannot show as `Status.UNREFLECTED`.
+
+    Args:
+        boxes: First vertex and vertex count, int32 [n], and corners, vec3 [8 n].
+        solved: The corners.
+        unit_per_scene: Scale of the solver's frame.
+        focal: Of the camera. [pixels]
+        pixels: Bounds of the mirror's.
+        out_vertex: The scene's own vertices come first.
+
+    Returns:
+        uint8 [n], 1 of those boxes.
+    """
+    first, count, corners = boxes
+    device = corners.device
+    gone = wp.empty(len(first), dtype=wp.uint8, device=device)
+    inputs = [corners, solved.status, solved.screen, solved.reach, unit_per_scene, focal]
+    launch(gone_kernel, len(first), [*inputs, wp.vec4(*(float(side) for side in pixels)), gone], device)
+    lanes = GONE_LANES if stays(device) else 1
+    inputs = [gone, first, count, lanes, out_vertex.status, out_vertex.screen]
+    launch(settle_gone_kernel, lanes * len(first), inputs, device)
+    return gone
 
 
 def whole(scene: Scene, part: PartRange) -> VirtualMesh:
