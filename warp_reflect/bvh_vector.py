@@ -48,6 +48,9 @@ _CONSTANTS = f"""
     constexpr int RAYS = TILE_WIDTH * TILE_HEIGHT, GROUPS = RAYS / LANES;
     struct Tile { enum { value = GROUPS }; };
     int ray[RAYS], taken = 0;
+    // A tile that is full, whose rows of rays begin at these places.
+    bool full = false;
+    int row_start[TILE_HEIGHT];
     int at[TILE_HEIGHT], stop[TILE_HEIGHT], next_place = block * BLOCK;
     const int last_place = next_place + BLOCK < count ? next_place + BLOCK : count;
     const int strips = width > 0 ? (width + STRIP - 1) / STRIP : 1;
@@ -71,6 +74,7 @@ _CONSTANTS = f"""
     }
     auto take = [&]() {
         taken = 0;
+        full = false;
         if (width == 0) {
             while (taken < RAYS && next_place < last_place) ray[taken++] = ray_at(next_place++);
             return;
@@ -82,13 +86,14 @@ _CONSTANTS = f"""
         }
         if (x == width) return;
         x -= (x - first_x) % TILE_WIDTH;
-        int middle[TILE_HEIGHT], end[TILE_HEIGHT];
+        int middle[TILE_HEIGHT], end[TILE_HEIGHT], full_rows = 0;
         for (int row = 0; row < TILE_HEIGHT; ++row) {
             const int own = (top + row) * width + x;
             int k = at[row];
             if (k + TILE_WIDTH <= stop[row] && number_at(k + TILE_WIDTH - 1) == own + TILE_WIDTH - 1) {
                 middle[row] = k + TILE_WIDTH / 2;
                 end[row] = k + TILE_WIDTH;
+                ++full_rows;
                 continue;
             }
             while (k < stop[row] && number_at(k) < own + TILE_WIDTH / 2) ++k;
@@ -96,23 +101,33 @@ _CONSTANTS = f"""
             while (k < stop[row] && number_at(k) < own + TILE_WIDTH) ++k;
             end[row] = k;
         }
+        full = full_rows == TILE_HEIGHT && indexed == 0;
+        if (full) {
+            for (int row = 0; row < TILE_HEIGHT; ++row) {
+                row_start[row] = at[row];
+                at[row] = end[row];
+            }
+            taken = RAYS;
+            return;
+        }
         for (int half = 0; half < 2; ++half)
             for (int row = 0; row < TILE_HEIGHT; ++row)
                 for (int k = half ? middle[row] : at[row]; k < (half ? end[row] : middle[row]); ++k) ray[taken++] = ray_at(k);
         for (int row = 0; row < TILE_HEIGHT; ++row) at[row] = end[row];
     };
-    // Where rays follow one another in fours, as in full tiles: rows are read and turned.
-    const I in_row = lanes() & 3;
-    auto by_rows = [&](I own) -> bool {
+    // Of a full tile rays follow one another in fours, which begin there: rows are read and turned.
+    auto four_of = [&](int lane) -> int { return row_start[lane / 4 % TILE_HEIGHT] + lane / 4 / TILE_HEIGHT * 4; };
+    auto own_of = [&](int g) -> I {
+        if (!full) return iload(ray + g * LANES);
         I first;
-        EACH_LANE first[l] = own[l & ~3];
-        return !bits(own - first != in_row);
+        EACH_LANE first[l] = four_of(g * LANES + l);
+        return first + (lanes() & 3);
     };
-    auto rows = [&](const float* p, I own, bool ordered) -> V {
+    auto rows = [&](const float* p, I own) -> V {
 #if defined(__AVX512F__)
         return vgather(p, own);
 #else
-        if (!ordered) return vgather(p, own);
+        if (!full) return vgather(p, own);
         auto four = [&](int k) -> Four { Four v; __builtin_memcpy(&v, p + k, sizeof(v)); return v; };
         const int one = 3 * own[0], other = 3 * own[4];
         float both[24];
@@ -139,28 +154,31 @@ _CONSTANTS = f"""
         met.t = pick(hit, pick(exact, fmax(t, F(0.0f)), met.t), F(0.0f));
         const F cu = fmax(pick(exact, u, met.v), F(0.0f)), cv = fmax(pick(exact, v, 1.0f - met.u - met.v), F(0.0f));
         const F total = cu + cv;
-        const I beyond = total > 1.0f;
-        met.u = pick(hit, pick(beyond, cu / total, cu), F(0.0f));
-        met.v = pick(hit, pick(beyond, cv / total, cv), F(0.0f));
+        const I beyond = hit & (total > 1.0f);
+        met.u = pick(hit, cu, F(0.0f));
+        met.v = pick(hit, cv, F(0.0f));
+        if (bits(beyond)) {
+            met.u = pick(beyond, cu / total, met.u);
+            met.v = pick(beyond, cv / total, met.v);
+        }
     };
     int state = 0;
     for (take(); taken > 0; take()) {
-        for (int k = taken; k < RAYS; ++k) ray[k] = ray[taken - 1];
+        if (!full)
+            for (int k = taken; k < RAYS; ++k) ray[k] = ray[taken - 1];
         V from[GROUPS], o[GROUPS], d[GROUPS], along[GROUPS];
         I live[GROUPS], own[GROUPS], moved[GROUPS], missed[GROUPS];
         F reach[GROUPS];
         Met met[GROUPS];
-        bool ordered[GROUPS];
         for (int g = 0; g < GROUPS; ++g) {
             live[g] = g * LANES + lanes() < taken;
-            own[g] = iload(ray + g * LANES);
-            ordered[g] = by_rows(own[g]);
-            from[g] = rows(points, own[g], ordered[g]);
-            along[g] = rows(directions, own[g], ordered[g]);
+            own[g] = own_of(g);
+            from[g] = rows(points, own[g]);
+            along[g] = rows(directions, own[g]);
             // bvh.ray_offset
             const F offset = 16.0f * 1.1920929e-7f * (__builtin_elementwise_abs(from[g].x)
                 + __builtin_elementwise_abs(from[g].y) + __builtin_elementwise_abs(from[g].z));
-            o[g] = add(from[g], times(offset, rows(normals, own[g], ordered[g])));
+            o[g] = add(from[g], times(offset, rows(normals, own[g])));
             d[g] = flushed(along[g]);
             reach[g] = F(3.0e38f);
             moved[g] = I(0);
@@ -190,7 +208,16 @@ _CONSTANTS = f"""
             if (retry == 0 || !bits(some)) break;
         }
         for (int g = 0; g < GROUPS; ++g) {
-            const I facet = igather(facets.data, pixel.shape[0] > 0 ? igather(pixel.data, own[g]) : own[g]);
+            I facet;
+            if (full) {
+                for (int l = 0; l < LANES; l += 4) {
+                    const int start = four_of(g * LANES + l);
+                    const int* of = facets.data + (pixel.shape[0] > 0 ? pixel.data[start] : start);
+                    for (int k = 0; k < 4; ++k) facet[l + k] = of[k];
+                }
+            } else {
+                facet = igather(facets.data, pixel.shape[0] > 0 ? igather(pixel.data, own[g]) : own[g]);
+            }
             I first = I(body.first_triangle), length = I(body.triangle_count);
             if (bodies.shape[0] > 0) {
                 const I patch = igather(patches.data, facet);
@@ -213,13 +240,14 @@ _CONSTANTS = f"""
             float t[LANES], u[LANES], v[LANES];
             istore(at, own[g]); istore(face, m.face); istore(told, status);
             store(t, m.t); store(u, m.u); store(v, m.v);
-            if (ordered[g] && !bits(~live[g])) {
+            if (full) {
                 for (int l = 0; l < LANES; l += 4) {
-                    __builtin_memcpy(out_triangle.data + at[l], face + l, 16);
-                    __builtin_memcpy(out_u.data + at[l], u + l, 16);
-                    __builtin_memcpy(out_v.data + at[l], v + l, 16);
-                    __builtin_memcpy(out_t.data + at[l], t + l, 16);
-                    for (int k = 0; k < 4; ++k) out_status.data[at[l] + k] = (unsigned char)told[l + k];
+                    const int start = four_of(g * LANES + l);
+                    __builtin_memcpy(out_triangle.data + start, face + l, 16);
+                    __builtin_memcpy(out_u.data + start, u + l, 16);
+                    __builtin_memcpy(out_v.data + start, v + l, 16);
+                    __builtin_memcpy(out_t.data + start, t + l, 16);
+                    for (int k = 0; k < 4; ++k) out_status.data[start + k] = (unsigned char)told[l + k];
                 }
             } else {
                 for (unsigned some = bits(live[g]); some != 0; some &= some - 1) {
