@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import warp as wp
 
 import warp_reflect as wr
-from warp_reflect import launch
+from warp_reflect import counts, launch, timing
 
 ROOT = Path(__file__).parent.parent
 SIZE = 160, 90
@@ -52,6 +53,46 @@ def test_the_devices_way_shows_the_same_picture(host_copies, device):
         there = wr.render_frame(scene, plan)
     for channel in ("RGBA", "reflectedPoint", "status"):
         np.testing.assert_array_equal(there[channel], here[channel])
+
+
+def test_stages_of_a_device_are_waited_for_when_their_time_is_asked(monkeypatch):
+    """With marks that stand for CUDA's events: numbers of the moment at which each was made."""
+    made, asked = [], []
+
+    def elapsed(begin, end):
+        asked.append((begin, end))
+        return float(end - begin)
+
+    monkeypatch.setattr(wp, "Event", lambda device, enable_timing: made.append(device) or len(made))
+    monkeypatch.setattr(wp, "record_event", lambda mark: None)
+    monkeypatch.setattr(wp, "get_event_elapsed_time", elapsed)
+    timer = timing.StageTimer()
+    timer._device = SimpleNamespace(is_cuda=True)
+    with timer("raster"):
+        pass
+    with timer("reflect"):
+        with timer("search"):
+            pass
+    with timer("raster"):
+        pass
+    timer.count_inside("reflect", {"refine": 5.0})
+    assert not asked
+    assert dict(timer.ms) == {"raster": 2.0, "reflect": 3.0, "reflect/search": 1.0, "reflect/refine": 5.0}
+    assert list(timer.ms) == ["raster", "reflect", "reflect/search", "reflect/refine"] and timer.total_ms == 5.0
+    assert len(asked) == 4
+
+
+def test_numbers_are_found_out_once_and_when_asked():
+    asked = []
+    total = counts.Statistics({"bvh": 1, "reused_px": 0.5})
+    total.later(lambda: asked.append("first") or {"bvh": 2, "walk": 7})
+    counts.add_statistics(total, {"reused_px": 0.25, "walk": 1})
+    total["culled"] = 3
+    assert not asked
+    assert total == {"bvh": 3, "reused_px": 0.5, "walk": 8, "culled": 3} and total["walk"] == 8
+    total["walk"] += 1
+    del total["bvh"]
+    assert dict(total) == {"reused_px": 0.5, "walk": 9, "culled": 3} and asked == ["first"] and len(total) == 3
 
 
 # Stage, method, settings: reads and bytes of a warm frame at most, and bytes written.

@@ -17,7 +17,8 @@ import numpy as np
 import warp as wp
 
 from warp_reflect import bvh, launch, shade
-from warp_reflect.layers import GBuffer, MirrorPixels, ReflectionLayer, Reflector, add_statistics, meets
+from warp_reflect.counts import add_statistics
+from warp_reflect.layers import GBuffer, MirrorPixels, ReflectionLayer, Reflector, meets
 from warp_reflect.normal_maps import prepare_normals
 from warp_reflect.scene import SHAPE_NONE, Scene, SceneView
 from warp_reflect.settings import Status, Technique

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import os
+from collections.abc import Mapping
 from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
@@ -23,8 +24,9 @@ from warp_reflect import (
 )
 from warp_reflect.channels import CHANNELS, POINTS, component_of, known_names, reflection_channels
 from warp_reflect.choice import Spent
+from warp_reflect.counts import add_statistics
 from warp_reflect.effects import FINISHES, PANE_FINISHES, finish_of, moves_with_time
-from warp_reflect.layers import NO_REFLECTOR, Camera, GBuffer, MirrorPixels, ReflectionLayer, add_statistics
+from warp_reflect.layers import NO_REFLECTOR, Camera, GBuffer, MirrorPixels, ReflectionLayer
 from warp_reflect.plan_rows import PaneRow, PlanRow
 from warp_reflect.planner import Plan, find_camera, keep_pace
 from warp_reflect.scene import Scene
@@ -59,7 +61,7 @@ class Frame:
         gbuffer: GBuffer,
         layers: dict[int, ReflectionLayer],
         picture: tuple,
-        timings: dict[str, float],
+        timings: Mapping[str, float],
         previous: Frame | None = None,
         transmitted: dict[int, transmission.Transmission] | None = None,
     ):
@@ -67,10 +69,15 @@ class Frame:
         self._before = None if previous is None else (previous.scene, previous.camera)
         self.scene, self.plan, self.gbuffer, self.layers = scene, plan, gbuffer, layers
         self.camera: Camera = gbuffer.camera
-        self.timings = timings
+        self._timings = timings
         self._picture = picture
         self.kept = _kept(layers, previous)
         self.transmitted = transmitted or {}
+
+    @cached_property
+    def timings(self) -> dict[str, float]:
+        """See above; waited for when first asked for."""
+        return dict(self._timings)
 
     @cached_property
     def statistics(self) -> dict:
@@ -262,7 +269,7 @@ def render_frame(scene: Scene, plan: Plan, camera: str | Camera | None = None, p
     """
     timer = StageTimer(scene.device)
     plan = plan.at(scene, None if previous is None else previous.plan)
-    if previous is not None and not previous.kept:
+    if previous is not None and not previous.kept and plan.settings.budget_ms > 0.0:
         plan = keep_pace(plan, previous.plan, previous.spent)
     settings = plan.settings
     view = plan.camera if camera is None else find_camera(scene, camera, plan.size)
@@ -286,11 +293,9 @@ def render_frame(scene: Scene, plan: Plan, camera: str | Camera | None = None, p
         if interfaces is not None:
             with timer("transmission"):
                 transmitted = _look_through(scene, plan, shown, interfaces, met, surfaces, picture)
-    timings = timer.ms
     for id in layers.keys() - kept:
-        for step, ms in layers[id].timings.items():
-            timings["reflect/" + step] = timings.get("reflect/" + step, 0.0) + ms
-    return Frame(scene, plan, gbuffer, layers, picture, timings, previous, transmitted)
+        timer.count_inside("reflect", layers[id].timings)
+    return Frame(scene, plan, gbuffer, layers, picture, timer.ms, previous, transmitted)
 
 
 def reflect_scene(

@@ -6,12 +6,12 @@ The *eye frame* has world axes and its origin at the eye.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, MutableMapping
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 import warp as wp
 
+from warp_reflect.counts import Statistics
 from warp_reflect.scene import CameraData, Scene
 from warp_reflect.settings import Status
 
@@ -260,41 +260,6 @@ class Reflector:
     convex: bool
 
 
-class Statistics(MutableMapping):
-    """Counts by name. What a device knows is read from it when any of them is asked for, not before."""
-
-    def __init__(self, known: dict | None = None):
-        self._known = dict(known or {})
-        self._later: list[Callable[[], Mapping]] = []
-
-    def later(self, counted: Callable[[], Mapping]) -> None:
-        """Add what is to be counted when it is asked for."""
-        self._later.append(counted)
-
-    def _all(self) -> dict:
-        while self._later:
-            add_statistics(self._known, self._later.pop()())
-        return self._known
-
-    def __getitem__(self, name: str):
-        return self._all()[name]
-
-    def __setitem__(self, name: str, value) -> None:
-        self._known[name] = value
-
-    def __delitem__(self, name: str) -> None:
-        del self._all()[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._all())
-
-    def __len__(self) -> int:
-        return len(self._all())
-
-    def __repr__(self) -> str:
-        return repr(self._all())
-
-
 @dataclass
 class ReflectionLayer:
     """The common answer of every technique for the pixels of one reflector, in the order of its `MirrorPixels`.
@@ -323,7 +288,7 @@ class ReflectionLayer:
     distance: wp.array
     status: wp.array
     statistics: Statistics | dict = field(default_factory=Statistics)
-    timings: dict = field(default_factory=dict)
+    timings: Statistics | dict = field(default_factory=dict)
     history: object = None
     virtual: list = field(default_factory=list)
     cells: list = field(default_factory=list)
@@ -348,12 +313,3 @@ def meets(scene: Scene, layer: ReflectionLayer, patches: np.ndarray) -> bool:
     triangle = layer.triangle.numpy()
     met = scene.host_triangle_patch.take(triangle, mode="clip")
     return bool((patches.take(met) & (triangle >= 0)).any())
-
-
-def add_statistics(total: MutableMapping, statistics: Mapping) -> None:
-    """Add a layer's statistics to a total: counts add up, bounds (names that end in `_px`) are the largest."""
-    if isinstance(total, Statistics):
-        total.later(lambda: statistics)
-        return
-    for name, value in statistics.items():
-        total[name] = max(total.get(name, 0.0), value) if name.endswith("_px") else total.get(name, 0) + value

@@ -8,6 +8,7 @@ from time import perf_counter
 
 import warp as wp
 
+from warp_reflect.counts import Statistics, add_statistics
 from warp_reflect.launch import loading_ms
 
 _clocks: list[Callable[[], float]] = [perf_counter]
@@ -32,17 +33,17 @@ def counted_by(clock: Callable[[], float]) -> Iterator[None]:
 class StageTimer:
     """Adds up the time spent in named stages, in the order they were first entered.
 
-    `with timer("raster"): ...` counts everything launched inside: on CUDA the device is waited for at both
-    ends (on the CPU a launch returns when it is done). The loading of kernels is left out. A stage opened inside
-    another is named after it: "search" inside "reflect" is "reflect/search", and counts towards both. For one
+    `with timer("raster"): ...` counts everything launched inside. On CUDA the device marks both ends, and is waited for only
+    where the time is asked for (on the CPU a launch returns when it is done). The loading of kernels is left out. A stage
+    opened inside another is named after it: "search" inside "reflect" is "reflect/search", and counts towards both. For one
     thread at a time.
 
     Attributes:
-        ms: Stage name to milliseconds of the clock at hand (`counted_by`).
+        ms: Stage name to milliseconds of the clock at hand (`counted_by`), or of the device.
     """
 
     def __init__(self, device: wp.DeviceLike = "cpu"):
-        self.ms: dict[str, float] = {}
+        self.ms = Statistics()
         self._device = wp.get_device(device)
         self._open: list[str] = []
 
@@ -50,28 +51,37 @@ class StageTimer:
     def __call__(self, name: str) -> Iterator[None]:
         parent = self._open[-1] + "/" if self._open else ""
         full = name if name.startswith(parent) else parent + name
-        self.ms.setdefault(full, 0.0)
+        add_statistics(self.ms, {full: 0.0})  # in the order they were entered
         self._open.append(full)
-        self._wait()
-        clock = _clocks[-1]
+        clock, begin = _clocks[-1], self._mark()
         start, loading = clock(), loading_ms()
         try:
             yield
-            self._wait()
         finally:
-            self.ms[full] += 1000.0 * (clock() - start) - (loading_ms() - loading)
+            if begin is None:
+                add_statistics(self.ms, {full: 1000.0 * (clock() - start) - (loading_ms() - loading)})
+            else:
+                end = self._mark()
+                self.ms.later(lambda: {full: wp.get_event_elapsed_time(begin, end)})
             self._open.pop()
 
     def count(self, ms: Mapping[str, float]) -> None:
         """Add what was spent before, under the names of outermost stages."""
-        for name, spent in ms.items():
-            self.ms[name] = self.ms.get(name, 0.0) + spent
+        add_statistics(self.ms, ms)
+
+    def count_inside(self, name: str, ms: Mapping[str, float]) -> None:
+        """Add what was spent in stages inside one."""
+        self.ms.later(lambda: {f"{name}/{inner}": spent for inner, spent in ms.items()})
 
     @property
     def total_ms(self) -> float:
         """Time in all outermost stages [ms]."""
         return sum(ms for name, ms in self.ms.items() if "/" not in name)
 
-    def _wait(self) -> None:
-        if self._device.is_cuda:
-            wp.synchronize_device(self._device)
+    def _mark(self) -> wp.Event | None:
+        """A mark in what a CUDA device has to do."""
+        if not self._device.is_cuda:
+            return None
+        mark = wp.Event(self._device, enable_timing=True)
+        wp.record_event(mark)
+        return mark

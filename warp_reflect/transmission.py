@@ -26,13 +26,13 @@ import numpy as np
 import warp as wp
 
 from warp_reflect import bvh, launch, shade, vector
+from warp_reflect.counts import add_statistics
 from warp_reflect.layers import (
     NO_REFLECTOR,
     CameraView,
     GBuffer,
     MirrorPixels,
     ReflectionLayer,
-    add_statistics,
     eye_ray_direction,
     meets,
 )

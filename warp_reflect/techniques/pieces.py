@@ -16,7 +16,8 @@ import numpy as np
 import warp as wp
 
 from warp_reflect import bvh
-from warp_reflect.layers import Camera, GBuffer, MirrorPixels, ReflectionLayer, Reflector, add_statistics
+from warp_reflect.counts import add_statistics
+from warp_reflect.layers import Camera, GBuffer, MirrorPixels, ReflectionLayer, Reflector
 from warp_reflect.scene import Scene
 from warp_reflect.settings import Settings
 
