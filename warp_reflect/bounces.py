@@ -18,7 +18,7 @@ import warp as wp
 
 from warp_reflect import bvh, launch, shade
 from warp_reflect.counts import add_statistics
-from warp_reflect.layers import GBuffer, MirrorPixels, ReflectionLayer, Reflector, meets
+from warp_reflect.layers import GBuffer, MirrorPixels, ReflectionLayer, Reflector, meeting
 from warp_reflect.normal_maps import prepare_normals
 from warp_reflect.scene import SHAPE_NONE, Scene, SceneView
 from warp_reflect.settings import Status, Technique
@@ -62,15 +62,15 @@ def reflect_hits_kernel(
     first: int,
     scene: SceneView,
     lights: LightView,
-    bodies: wp.array(dtype=bvh.OwnBody),
     looks: wp.array(dtype=Look),
     normals: wp.array(dtype=wp.vec3),
-    # Rays and what they met:
+    # Rays, what they met, and which of them are asked:
     triangle: wp.array(dtype=int),
     u: wp.array(dtype=float),
     v: wp.array(dtype=float),
     direction: wp.array(dtype=wp.vec3),
     weight: wp.array(dtype=wp.vec3),
+    index: wp.array(dtype=int),
     # Outputs:
     out_point: wp.array(dtype=wp.vec3),
     out_normal: wp.array(dtype=wp.vec3),
@@ -78,14 +78,10 @@ def reflect_hits_kernel(
     out_weight: wp.array(dtype=wp.vec3),
     out_domes: wp.array(dtype=wp.vec3),
 ):
-    """One thread per ray: its reflection at the mirror that it met, and what the domes gave there; weight 0 where none is."""
-    i = first + wp.tid()
+    """One thread per asked ray: its reflection at the mirror that it met, and what the domes gave there; weight 0: too dark."""
+    k = first + wp.tid()
+    i = index[k]
     tri = triangle[i]
-    if tri < 0:
-        return
-    patch = scene.triangle_patch[tri]
-    if bodies[patch].triangle_count == 0:
-        return
     d = direction[i]
     look = Look()
     if looks.shape[0] > 0:
@@ -96,14 +92,16 @@ def reflect_hits_kernel(
     n = shown_normal(normals, i, hit_normal(scene, tri, u[i], v[i]))
     cosine = wp.dot(n, d)
     lobes = shade.split_lobes(look, wp.vec3(0.0, 0.0, 0.0), wp.abs(cosine), False)
-    carried = wp.cw_mul(weight[i], lobes.mirror)
+    carried = lobes.mirror
+    if weight.shape[0] > 0:
+        carried = wp.cw_mul(weight[i], carried)
     if wp.max(carried) < LEAST_WEIGHT:
         return
     onward = d - 2.0 * cosine * n
-    out_domes[i] = wp.cw_mul(carried, shade.dome_radiance(lights, onward))
+    out_domes[k] = wp.cw_mul(carried, shade.dome_radiance(lights, onward))
     corner = scene.triangles[tri]
     p = (1.0 - u[i] - v[i]) * scene.points[corner[0]] + u[i] * scene.points[corner[1]] + v[i] * scene.points[corner[2]]
-    if scene.patches[patch].shape != SHAPE_NONE and normals.shape[0] == 0:
+    if scene.patches[scene.triangle_patch[tri]].shape != SHAPE_NONE and normals.shape[0] == 0:
         polished = polish(scene, tri, p, d)
         if polished[0] != 0.0 or polished[1] != 0.0 or polished[2] != 0.0:
             n = wp.vec3(polished[0], polished[1], polished[2])
@@ -111,10 +109,10 @@ def reflect_hits_kernel(
             onward = d - 2.0 * wp.dot(n, d) * n
     if wp.dot(n, d) > 0.0:
         n = -n
-    out_point[i] = p
-    out_normal[i] = n
-    out_direction[i] = wp.normalize(onward)
-    out_weight[i] = carried
+    out_point[k] = p
+    out_normal[k] = n
+    out_direction[k] = wp.normalize(onward)
+    out_weight[k] = carried
 
 
 @wp.kernel
@@ -164,19 +162,20 @@ def onward(
         vec3 [n]; `seen` itself where no mirror is met. The layer's statistics get `bounced`: rays followed, and
         `bounce_limit`: those whose mirror shows the domes as `bounces` ended there.
     """
-    if not meets(scene, layer, mirrors.patches):
-        return seen
-    device, bodies, width = scene.device, mirrors.bodies, gbuffer.camera.size[0]
-    index = np.arange(layer.pixels.count, dtype=np.int32)
-    weight = wp.full(layer.pixels.count, wp.vec3(1.0, 1.0, 1.0), dtype=wp.vec3, device=device)
+    device, width = scene.device, gbuffer.camera.size[0]
+    index, weight = None, wp.zeros(0, dtype=wp.vec3, device=device)
     first, total = layer, seen
     for depth in range(bounces + 1):
-        n = layer.pixels.count
+        asked = meeting(scene, layer, mirrors.patches)
+        n = len(asked)
+        if n == 0:
+            break
         looks = prepare_looks(scene, gbuffer, layer, threads)
         normals = prepare_normals(scene, gbuffer, layer, threads)
         point, normal, direction, carried, domes = (wp.zeros(n, dtype=wp.vec3, device=device) for _ in range(5))
-        inputs = [scene.view, scene.lights, bodies, looks, normals, layer.triangle, layer.u, layer.v]
-        inputs += [layer.pixels.direction, weight, point, normal, direction, carried, domes]
+        inputs = [scene.view, scene.lights, looks, normals, layer.triangle, layer.u, layer.v]
+        inputs += [layer.pixels.direction, weight, wp.array(asked, dtype=int, device=device)]
+        inputs += [point, normal, direction, carried, domes]
         launch.launch(reflect_hits_kernel, n, inputs, device, threads)
         going = np.flatnonzero(carried.numpy().max(axis=1) > 0.0)
         if not len(going):
@@ -187,17 +186,24 @@ def onward(
         add_statistics(first.statistics, {"bounced": len(going)})
         if total is seen:
             total = wp.clone(seen)
-        taken = lambda array: wp.array(array.numpy()[going], dtype=array.dtype, device=device)  # noqa: B023, E731
-        index, weight, domes, facet = index[going], taken(carried), taken(domes), taken(layer.triangle)
-        pixel, box = taken(layer.pixels.pixel), layer.pixels.box
-        pixels = MirrorPixels(layer.pixels.reflector, pixel, taken(point), taken(normal), taken(direction), box)
+        if len(going) < n:
+            asked = asked[going]
+            point, normal, direction, carried, domes = (
+                wp.array(array.numpy()[going], dtype=wp.vec3, device=device)
+                for array in (point, normal, direction, carried, domes)
+            )
+        index, weight = asked if index is None else index[asked], carried
+        facet, pixel = (
+            wp.array(array.numpy()[asked], dtype=int, device=device) for array in (layer.triangle, layer.pixels.pixel)
+        )
+        pixels = MirrorPixels(layer.pixels.reflector, pixel, point, normal, direction, layer.pixels.box)
         layer = ReflectionLayer.empty(pixels, Technique.RAYTRACED, device)
         if forward is not None and depth == 0:
             forward(layer, facet)
-            _trace_others(scene, layer, facet, bodies, threads, kernels, width)
+            _trace_others(scene, layer, facet, mirrors.bodies, threads, kernels, width)
             add_statistics(first.statistics, layer.statistics)
         else:
-            bvh.trace_bounced(scene, layer, facet, bodies, threads, kernels, width)
+            bvh.trace_bounced(scene, layer, facet, mirrors.bodies, threads, kernels, width)
         numbers = wp.array(index, dtype=int, device=device)
         launch.launch(add_bounce_kernel, len(going), [numbers, weight, domes, met(layer), total], device, threads)
     return total

@@ -308,8 +308,8 @@ class ReflectionLayer:
         )
 
 
-def meets(scene: Scene, layer: ReflectionLayer, patches: np.ndarray) -> bool:
-    """Whether any ray of a layer meets one of the patches, bool [patches of the scene]."""
+def meeting(scene: Scene, layer: ReflectionLayer, patches: np.ndarray) -> np.ndarray:
+    """Which rays of a layer meet one of the patches, bool [patches of the scene]: int32, ascending."""
     triangle = layer.triangle.numpy()
     met = scene.host_triangle_patch.take(triangle, mode="clip")
-    return bool((patches.take(met) & (triangle >= 0)).any())
+    return np.flatnonzero(patches.take(met) & (triangle >= 0)).astype(np.int32)

@@ -34,7 +34,7 @@ from warp_reflect.layers import (
     MirrorPixels,
     ReflectionLayer,
     eye_ray_direction,
-    meets,
+    meeting,
 )
 from warp_reflect.normal_maps import prepare_normals
 from warp_reflect.optics import PI, dielectric_reflectance, refract, tangent_basis
@@ -599,7 +599,7 @@ def behind(
     """
     device, threads = scene.device, settings.threads
     count = layer.pixels.count
-    if not meets(scene, layer, interfaces.clear):
+    if not len(meeting(scene, layer, interfaces.clear)):
         if patches is None and nearness is None:
             return seen
         total = wp.empty(count, dtype=wp.vec3, device=device) if patches is not None else seen
