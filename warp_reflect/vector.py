@@ -224,9 +224,13 @@ def block_count(count: int) -> int:
     return -(-count // BLOCK)
 
 
-def launch_blocks(kernel, count: int, inputs: list, device, threads: int = 0) -> None:
-    """Run a vector kernel, whose arguments after `first` are `inputs`, over `count` elements."""
-    launch(kernel, block_count(count), inputs, device, threads, split_min=BLOCK_SPLIT_MIN)
+def launch_blocks(kernel, count: int, inputs: list, device, threads: int = 0, blocks: int = 1) -> None:
+    """Run a vector kernel, whose arguments after `first` are `inputs`, over `count` elements.
+
+    Args:
+        blocks: Of each of its tasks.
+    """
+    launch(kernel, -(-block_count(count) // blocks), inputs, device, threads, split_min=BLOCK_SPLIT_MIN // blocks)
 
 
 @wp.func_native(

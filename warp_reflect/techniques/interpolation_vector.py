@@ -86,7 +86,6 @@ wp.set_module_options({"enable_backward": False})
         }
     }
 """,
-        wide=True,
     )
 )
 def step_chunk(

@@ -33,6 +33,8 @@ from warp_reflect.techniques.vertices import ESTIMATE, SolveFrame, VertexView
 
 wp.set_module_options({"enable_backward": False})
 
+BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors together
+
 
 @wp.func_native(
     vector.snippet(
@@ -40,102 +42,97 @@ wp.set_module_options({"enable_backward": False})
         + REFLECTOR_MAP
         + r"""
     const int count = points.shape[0];
-    const int begin = block * BLOCK;
-    const int end = begin + BLOCK < count ? begin + BLOCK : count;
     const V white_eye = product(eye, inv_extent);
     const F eye_height = fmax(length(white_eye) - 1.0f, F(1.0e-3f));
-    // What is left to search, side by side, and a vector more for the last load.
-    float at[6][BLOCK + LANES];
-    int vertex_of[BLOCK + LANES];
-    int searched = 0;
-    for (int start = begin; start < end; start += LANES) {
-        const I element = start + lanes();
-        const I valid = element < end;
-        const I own = ipick(valid, element, I(end - 1));
-        I known;
-        EACH_LANE known[l] = status[own[l]];
-        I asked = valid & (known == 0) & ~((own >= own_first) & (own < own_first + own_count));
-        if (!bits(asked)) continue;
-        const V target = add(matrix(frame.unit_from_scene, vgather((const float*)points.data, own)), spread(frame.unit_offset));
-        // map_search.is_visible
-        const V white = product(target, inv_extent);
-        const V d = sub(white, white_eye);
-        F t = clip(-dot(white_eye, d) / fmax(dot(d, d), F(1.0e-30f)), 0.0f, 1.0f);
-        const F nearest = length(add(white_eye, times(t, d)));
-        I visible = nearest > map.outer_radius;
-        I open = asked & ~visible & ~(nearest < map.inner_radius);
-        if (bits(open)) {
-            const V direction = sub(target, eye);
-            F low = F(0.0f), high = F(1.0f);
-            for (int k = 0; k < gauge_steps && bits(open); ++k) {
-                const V w = add(white_eye, times(t, d));
-                const Sample s = sample(project_to_cube(w));
-                open &= ~(length(w) < (1.0f + gauge_inside) * length(product(s.p, inv_extent)));
-                const I falls = dot(s.n, direction) < 0.0f;
-                low = pick(falls, t, low);
-                high = pick(falls, high, t);
-                const I ended = open & ((low >= 1.0f) | (high <= 0.0f));
-                visible |= ended;
-                open &= ~ended;
-                t = 0.5f * (low + high);
-            }
-            visible |= open;
-        }
-        for (unsigned left = bits(asked & ~visible); left != 0; left &= left - 1) {
-            const int i = start + __builtin_ctz(left);
-            status[i] = (unsigned char)hidden;
-            seeds[3 * i] = seeds[3 * i + 1] = seeds[3 * i + 2] = 0.0f;
-            screen[4 * i] = screen[4 * i + 1] = screen[4 * i + 3] = 0.0f;
-            screen[4 * i + 2] = -1.0f;
-        }
-        asked &= visible;
-        if (!bits(asked)) continue;
-        V seed = same(0.0f);
-        if (warm != 0) seed = vgather(seeds, own);
-        const I unknown = size(seed) == 0.0f;
-        seed = project_to_cube(seed);
-        if (bits(asked & unknown)) {
-            // map_search.first_guess
-            const F height = fmax(length(white) - 1.0f, F(1.0e-3f));
-            const F share = height / (eye_height + height);
-            const V w = add(times(share, white_eye), times(1.0f - share, white));
-            seed = vpick(unknown, project_to_cube(vpick(size(w) < 1.0e-6f, white_eye, w)), seed);
-        }
-        const F each[6] = {target.x, target.y, target.z, seed.x, seed.y, seed.z};
-        if (bits(asked) == bits(I(-1))) {
-            for (int k = 0; k < 6; ++k) store(at[k] + searched, each[k]);
-            istore(vertex_of + searched, own);
-            searched += LANES;
-        } else {
-            float lane[6][LANES];
-            for (int k = 0; k < 6; ++k) store(lane[k], each[k]);
-            for (unsigned left = bits(asked); left != 0; left &= left - 1) {
-                const int l = __builtin_ctz(left);
-                for (int k = 0; k < 6; ++k) at[k][searched] = lane[k][l];
-                vertex_of[searched++] = start + l;
-            }
-        }
-    }
-    // map_search.search_newton. A vector goes on while more than FEW of its lanes do: the others of the block go on side by
-    // side in the second round, and those that ended far from a root start again from a coarse seed in the third.
-    constexpr int ROUND_FIRST = 0, ROUND_FEW = 1, ROUND_COARSE = 2, FEW = 4;
-    enum { BEST = 3, STEP = 6, RESIDUAL = 9, SHRINK = 10, KEPT = 11 };
-    float few[KEPT][BLOCK + LANES], far[3][BLOCK + LANES];
-    int few_vertex[BLOCK + LANES], few_used[BLOCK + LANES], far_vertex[BLOCK + LANES];
+    // What is left to search, side by side, and a vector more for the last load: of a block, then of all blocks.
+    constexpr int FEW = 3, TASK = BLOCKS * BLOCK, FEW_ROW = FEW * TASK / LANES + LANES;
+    enum { X = 3, STEP = 6, RESIDUAL = 9, SHRINK = 10, KEPT = 11 };
+    float at[X + 3][BLOCK + LANES], few[KEPT][FEW_ROW], far[X + 3][TASK + LANES];
+    int vertex_of[BLOCK + LANES], few_vertex[FEW_ROW], few_used[FEW_ROW], far_vertex[TASK + LANES];
     int few_count = 0, far_count = 0;
-    for (int round = ROUND_FIRST; round <= ROUND_COARSE; ++round) {
-        const int going_on = round == ROUND_FIRST ? searched : round == ROUND_FEW ? few_count : far_count;
-        if (going_on == 0) continue;
-        float* rows = round == ROUND_FIRST ? at[0] : round == ROUND_FEW ? few[0] : far[0];
-        int* numbers = round == ROUND_FIRST ? vertex_of : round == ROUND_FEW ? few_vertex : far_vertex;
-        constexpr int ROW = BLOCK + LANES;
-        const int kept = round == ROUND_FIRST ? 6 : round == ROUND_FEW ? KEPT : 3;
-        for (int l = 0; l < LANES; ++l) {
-            for (int k = 0; k < kept; ++k) rows[k * ROW + going_on + l] = rows[k * ROW + going_on - 1];
-            numbers[going_on + l] = numbers[going_on - 1];
-            if (round == ROUND_FEW) few_used[going_on + l] = few_used[going_on - 1];
+    // map_search.search_newton. A vector goes on while more than FEW of its lanes do: the others go on side by side after the
+    // last block, and then those that ended far from a root start again from a coarse seed.
+    for (int round = 0; round < BLOCKS + 2; ++round) {
+        const bool in_few = round == BLOCKS, in_coarse = round == BLOCKS + 1;
+        int searched = in_few ? few_count : in_coarse ? far_count : 0;
+        if (round < BLOCKS) {
+            const int begin = (task * BLOCKS + round) * BLOCK;
+            const int end = begin + BLOCK < count ? begin + BLOCK : count;
+            for (int start = begin; start < end; start += LANES) {
+                const I element = start + lanes();
+                const I valid = element < end;
+                const I own = ipick(valid, element, I(end - 1));
+                I known;
+                EACH_LANE known[l] = status[own[l]];
+                I asked = valid & (known == 0) & ~((own >= own_first) & (own < own_first + own_count));
+                if (!bits(asked)) continue;
+                const V point = vrows((const float*)points.data, start, end - start >= LANES, own);
+                const V target = add(matrix(frame.unit_from_scene, point), spread(frame.unit_offset));
+                // map_search.is_visible
+                const V white = product(target, inv_extent);
+                const V d = sub(white, white_eye);
+                F t = clip(-dot(white_eye, d) / fmax(dot(d, d), F(1.0e-30f)), 0.0f, 1.0f);
+                const F nearest = length(add(white_eye, times(t, d)));
+                I visible = nearest > map.outer_radius;
+                I open = asked & ~visible & ~(nearest < map.inner_radius);
+                if (bits(open)) {
+                    const V direction = sub(target, eye);
+                    F low = F(0.0f), high = F(1.0f);
+                    for (int k = 0; k < gauge_steps && bits(open); ++k) {
+                        const V w = add(white_eye, times(t, d));
+                        const Sample s = sample(project_to_cube(w));
+                        open &= ~(length(w) < (1.0f + gauge_inside) * length(product(s.p, inv_extent)));
+                        const I falls = dot(s.n, direction) < 0.0f;
+                        low = pick(falls, t, low);
+                        high = pick(falls, high, t);
+                        const I ended = open & ((low >= 1.0f) | (high <= 0.0f));
+                        visible |= ended;
+                        open &= ~ended;
+                        t = 0.5f * (low + high);
+                    }
+                    visible |= open;
+                }
+                for (unsigned left = bits(asked & ~visible); left != 0; left &= left - 1) {
+                    const int i = start + __builtin_ctz(left);
+                    status[i] = (unsigned char)hidden;
+                    seeds[3 * i] = seeds[3 * i + 1] = seeds[3 * i + 2] = 0.0f;
+                    screen[4 * i] = screen[4 * i + 1] = screen[4 * i + 3] = 0.0f;
+                    screen[4 * i + 2] = -1.0f;
+                }
+                asked &= visible;
+                if (!bits(asked)) continue;
+                V seed = same(0.0f);
+                if (warm != 0) seed = vrows(seeds, start, end - start >= LANES, own);
+                const I unknown = size(seed) == 0.0f;
+                seed = project_to_cube(seed);
+                if (bits(asked & unknown)) {
+                    // map_search.first_guess
+                    const F height = fmax(length(white) - 1.0f, F(1.0e-3f));
+                    const F share = height / (eye_height + height);
+                    const V w = add(times(share, white_eye), times(1.0f - share, white));
+                    seed = vpick(unknown, project_to_cube(vpick(size(w) < 1.0e-6f, white_eye, w)), seed);
+                }
+                const F each[6] = {target.x, target.y, target.z, seed.x, seed.y, seed.z};
+                if (bits(asked) == bits(I(-1))) {
+                    for (int k = 0; k < 6; ++k) store(at[k] + searched, each[k]);
+                    istore(vertex_of + searched, own);
+                    searched += LANES;
+                } else {
+                    float lane[6][LANES];
+                    for (int k = 0; k < 6; ++k) store(lane[k], each[k]);
+                    for (unsigned left = bits(asked); left != 0; left &= left - 1) {
+                        const int l = __builtin_ctz(left);
+                        for (int k = 0; k < 6; ++k) at[k][searched] = lane[k][l];
+                        vertex_of[searched++] = start + l;
+                    }
+                }
+            }
         }
-        if (round == ROUND_COARSE) {
+        if (searched == 0) continue;
+        float* rows = in_few ? few[0] : in_coarse ? far[0] : at[0];
+        int* numbers = in_few ? few_vertex : in_coarse ? far_vertex : vertex_of;
+        const int ROW = in_few ? FEW_ROW : in_coarse ? TASK + LANES : BLOCK + LANES;
+        if (in_coarse) {
             // map_search.coarse_seed: the nodes are read once, then every target looks at all of them.
             constexpr int SIDE = COARSE_NODES, NODES = 6 * SIDE * SIDE, PADDED = (NODES + LANES - 1) / LANES * LANES;
             float node_p[3][PADDED], node_n[3][PADDED], node_x[3][PADDED];
@@ -176,27 +173,25 @@ wp.set_module_options({"enable_backward": False})
                         found = node[l];
                     }
                 }
-                // The places of the first round are free by now.
-                for (int k = 0; k < 3; ++k) {
-                    at[k][j] = far[k][j];
-                    at[3 + k][j] = found >= 0 ? node_x[k][found] : k == 0 ? 1.0f : 0.0f;
-                }
+                for (int k = 0; k < 3; ++k) far[X + k][j] = found >= 0 ? node_x[k][found] : k == 0 ? 1.0f : 0.0f;
             }
-            for (int l = 0; l < LANES; ++l) {
-                for (int k = 0; k < 6; ++k) at[k][going_on + l] = at[k][going_on - 1];
-            }
-            rows = at[0];
         }
-        for (int start = 0; start < going_on; start += LANES) {
+        const int kept = in_few ? KEPT : X + 3;
+        for (int l = searched; l < searched + LANES; ++l) {
+            for (int k = 0; k < kept; ++k) rows[k * ROW + l] = rows[k * ROW + searched - 1];
+            numbers[l] = numbers[searched - 1];
+            if (in_few) few_used[l] = few_used[searched - 1];
+        }
+        for (int start = 0; start < searched; start += LANES) {
             const float* row = rows + start;
-            const I asked = start + lanes() < going_on;
+            const I asked = start + lanes() < searched;
             const I vertex = iload(numbers + start);
             const V target = V{load(row), load(row + ROW), load(row + 2 * ROW)};
-            V x = V{load(row + BEST * ROW), load(row + (BEST + 1) * ROW), load(row + (BEST + 2) * ROW)};
+            V x = V{load(row + X * ROW), load(row + (X + 1) * ROW), load(row + (X + 2) * ROW)};
             V best = same(0.0f), p = same(0.0f), n = same(0.0f), step = same(0.0f);
             F residual = F(1.0e30f), shrink = F(1.0f);
             I going = asked, used = I(0);
-            bool resumed = round == ROUND_FEW;
+            bool resumed = in_few;
             if (resumed) {
                 best = x;
                 step = V{load(row + STEP * ROW), load(row + (STEP + 1) * ROW), load(row + (STEP + 2) * ROW)};
@@ -226,7 +221,7 @@ wp.set_module_options({"enable_backward": False})
                     going &= ~(residual <= settings.tolerance) & (shrink >= shrink_min) & (used < settings.iterations);
                     const unsigned left = bits(going);
                     if (left == 0) break;
-                    if (round == ROUND_FIRST && __builtin_popcount(left) <= FEW) {
+                    if (round < BLOCKS && __builtin_popcount(left) <= FEW) {
                         later = going;
                         break;
                     }
@@ -250,7 +245,7 @@ wp.set_module_options({"enable_backward": False})
             }
             I done = asked & ~later & (residual <= accepted), answer = I(converged);
             I rest = asked & ~later & ~done;
-            if (bits(rest) && round != ROUND_COARSE) {
+            if (bits(rest) && !in_coarse) {
                 for (unsigned left = bits(rest); left != 0; left &= left - 1) {
                     const int l = __builtin_ctz(left);
                     for (int k = 0; k < 3; ++k) far[k][far_count] = row[k * ROW + l];
@@ -284,12 +279,11 @@ wp.set_module_options({"enable_backward": False})
             settle(done, answer, vertex, best, residual, virtual_vertex(p, n, target), reach);
         }
     }
-""".replace("COARSE_NODES", str(COARSE_NODES)),
-        wide=True,
+""".replace("COARSE_NODES", str(COARSE_NODES)).replace("BLOCKS", str(BLOCKS)),
     )
 )
 def search_block(
-    block: int,
+    task: int,
     points: wp.array(dtype=wp.vec3),
     own_first: int,
     own_count: int,
@@ -332,7 +326,7 @@ def search_blocks_kernel(
     # Outputs (seed: in and out, zero where none):
     out_vertex: VertexView,
 ):
-    """One thread per block of vertices; as `reflector_map.search_kernel`."""
+    """One thread per `BLOCKS` blocks of vertices; as `reflector_map.search_kernel`."""
     search_block(
         first + wp.tid(),
         points,

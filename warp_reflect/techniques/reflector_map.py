@@ -98,7 +98,7 @@ def search(
     count = len(points)
     inputs = [points, *own, map.view, frame, camera, chosen, int(warm), out_vertex]
     if chosen.method != int(SEARCH_MIDPOINT) and vector.chosen(kernels, device):
-        vector.launch_blocks(map_vector.search_blocks_kernel, count, inputs, device, threads)
+        vector.launch_blocks(map_vector.search_blocks_kernel, count, inputs, device, threads, map_vector.BLOCKS)
     else:
         launch(search_kernel, count, inputs, device, threads)
 
