@@ -36,6 +36,7 @@ RAY_ALONG_MIN = wp.constant(0.02)  # sine between a ray and a plane below which 
 # Of the path: a crossing farther than this from the virtual triangle's depth lies outside the triangle.
 RAY_TRUST = wp.constant(0.25)
 DROPPED = wp.constant(-1.0)  # depth key of a vertex that has no picture
+TILE_SIDE = 8  # pixels: the most rows of a tile of the vector kernel
 CLIP_VERTICES = 9  # a triangle against five planes has at most eight corners
 
 _polygon = wp.types.matrix(shape=(CLIP_VERTICES, 4), dtype=wp.float32)
@@ -345,8 +346,12 @@ def cull_kernel(
     step: int,
     out_survivors: wp.array(dtype=int),
     out_survivor_count: wp.array(dtype=int),
+    out_nearest: wp.array(dtype=float),
 ):
-    """One thread per triangle; each slice of `step` triangles compacts its survivors at its own start."""
+    """One thread per triangle; each slice of `step` triangles compacts its survivors at its own start.
+
+    Beside each stands the depth key of its nearest corner, infinite where the eye's own plane cuts it; length 0: not asked for.
+    """
     i = first + wp.tid()
     corners = triangles[i]
     a = screen[corners[0]]
@@ -363,6 +368,11 @@ def cull_kernel(
     part = i / step
     place = wp.atomic_add(out_survivor_count, part, 1)
     out_survivors[part * step + place] = i
+    if out_nearest.shape[0] > 0:
+        nearest = wp.max(a[2], wp.max(b[2], c[2]))
+        if a[2] == 0.0 or b[2] == 0.0 or c[2] == 0.0:
+            nearest = wp.inf
+        out_nearest[part * step + place] = nearest
 
 
 @wp.func
@@ -545,35 +555,58 @@ def rasterise(
         return wp.zeros(1, dtype=int, device=device)
     step = slice_length(count, device, threads)
     slice_count = -(-count // step)
+    vectors = vector.chosen(kernels, device)
+    hides = vectors and target.view.ray.shape[0] == 0  # rays tell the depth late: nothing is known to lie behind
     survivors = wp.empty(count, dtype=int, device=device)
     survivor_count = wp.zeros(slice_count, dtype=int, device=device)
-    launch(cull_kernel, count, [target.view, screen, triangles, step, survivors, survivor_count], device, threads)
+    nearest = wp.empty(count if hides else 0, dtype=float, device=device)
+    inputs = [target.view, screen, triangles, step, survivors, survivor_count, nearest]
+    launch(cull_kernel, count, inputs, device, threads)
     if ids is None:
         ids = wp.empty(0, dtype=int, device=device)
     if points is None:
         points = wp.empty(0, dtype=wp.vec3, device=device)
-    inputs = [target.view, screen, triangles, ids, id_offset, step, survivors, survivor_count]
+    drawn, drawn_count = survivors, survivor_count
+    if not stays(device):
+        ranges = [(k * step, int(n)) for k, n in enumerate(survivor_count.numpy()) if n > 0]
+        if hides and ranges:
+            drawn = nearest_first(survivors, nearest, ranges)
+            step = len(drawn)
+            ranges, drawn_count = [(0, step)], wp.array([step], dtype=int, device=device)
+    inputs = [target.view, screen, triangles, ids, id_offset, step, drawn, drawn_count]
     inputs += [points, triangles if plane_triangles is None else plane_triangles]
     if stays(device):
         launch_bands(draw_kernel, [(0, count)], [(target.box[1], target.box[3])], inputs, device)
         return survivor_count
-    counts = survivor_count.numpy()
-    ranges = [(k * step, int(n)) for k, n in enumerate(counts) if n > 0]
-    bands = row_bands(target.box[1], target.box[3], slice_count)
     kernel = draw_kernel
-    if vector.chosen(kernels, device):
+    if vectors:
         from warp_reflect import raster_vector  # which draws with this module's functions
 
         kernel = raster_vector.draw_blocks_kernel
         # Every slice but the last, which is the only one where there is one, is a multiple of the block.
         ranges = [(begin // vector.BLOCK, vector.block_count(n)) for begin, n in ranges]
-    launch_bands(kernel, ranges, bands, inputs, device)
+        inputs.append(wp.zeros(raster_vector.tile_words(target.box) if hides else 0, dtype=wp.uint64, device=device))
+    launch_bands(kernel, ranges, row_bands(target.box[1], target.box[3], slice_count), inputs, device)
     return survivor_count
 
 
+def nearest_first(survivors: wp.array, nearest: wp.array, ranges: list[tuple[int, int]]) -> wp.array:
+    """Survivors of a culling on the CPU, those with the nearest corners first: what lies behind them need not be drawn.
+
+    Order counts half the bits of a key, which are sorted by their digits; of equal ones the order stays, and with it what
+    neighbours find in the caches.
+    """
+    parts = [slice(begin, begin + count) for begin, count in ranges]
+    keys = np.concatenate([nearest.numpy()[part] for part in parts]).view(np.int32)
+    order = np.argsort(-(keys >> 16).astype(np.int16), kind="stable")
+    return wp.array(np.concatenate([survivors.numpy()[part] for part in parts])[order], dtype=int, device="cpu")
+
+
 def row_bands(first: int, end: int, count: int) -> list[tuple[int, int]]:
-    """Rows [first, end) in at most `count` contiguous, non-empty bands."""
-    edges = np.unique(np.linspace(first, end, max(count, 1) + 1).astype(int))
+    """Rows [first, end) in at most `count` contiguous, non-empty bands; each but the last has whole tiles."""
+    edges = np.linspace(0, end - first, max(count, 1) + 1).astype(int)
+    edges[1:-1] -= edges[1:-1] % TILE_SIDE
+    edges = np.unique(first + edges)
     return list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
 
 

@@ -1,13 +1,16 @@
 """`raster.draw_kernel` with triangles and pixels side by side: the same picture, bit for bit.
 
-Triangles are set up in vectors, and those within a box of 64 pixels are scanned row by row. In the eye view, whose fragments
-need no memory but their own keys, pixels that lie side by side are drawn at once. Where rays tell the depth, what several
+Triangles are set up in vectors, and those within a box of 64 pixels are drawn without further ado; larger ones one at a time,
+and what has to be clipped by the plain kernel's functions. In the eye view, whose fragments need no memory but their own keys,
+pixels that lie side by side are drawn at once, tile by tile of 64 pixels: a tile remembers what it is covered by, and what
+lies behind that is not drawn (Hasselgren, Andersson and Akenine-Moeller, Masked Software Occlusion Culling, HPG 2016, section
+3, with one layer; here nothing is lost by it, as the depths themselves are kept too). Where rays tell the depth, what several
 triangles cover is gathered in one list: its vectors are full however few pixels a triangle has, and what a fragment needs of
-memory has been asked for by the time it is worked on. Larger triangles are drawn one at a time with pixels of a row side by
-side; what has to be clipped, by the plain kernel's functions.
+memory has been asked for by the time it is worked on.
 
 Edge functions of a triangle within a box of 64 pixels are exact in 32 bits (products below 2^29, sums of two below 2^30, and a
-vector reaches at most 15 pixels past the box); of larger ones in float64, whose 53 bits hold everything below 2^46.
+vector reaches at most 15 pixels past the box); of larger ones in float64, whose 53 bits hold everything below 2^46, or in
+64 bits where a tile begins.
 """
 
 from __future__ import annotations
@@ -31,9 +34,15 @@ wp.set_module_options({"enable_backward": False})
 
 BLOCK = wp.constant(vector.BLOCK)
 
+
+def tile_words(box: tuple[int, int, int, int]) -> int:
+    """Words for the tiles of a target over a box, whether they have 8 x 8 pixels or 16 x 4."""
+    x0, y0, x1, y1 = box
+    return 2 * -(-(x1 - x0) // 8) * -(-(y1 - y0) // 4)
+
+
 # What both snippets begin with.
 _TARGET = r"""
-    typedef long long S __attribute__((ext_vector_type(LANES)));
     auto snap = [](F x) -> I { return __builtin_convertvector(__builtin_elementwise_floor(x * 256.0f + 0.5f), I); };
     // raster.edge_bias
     auto edge_bias = [](I dx, I dy) -> I { return ((dy < 0) | ((dy == 0) & (dx > 0))) ? I(0) : I(-1); };
@@ -44,6 +53,82 @@ _TARGET = r"""
     const float* ray_of = (const float*)target.ray.data;
     unsigned long long* keys = (unsigned long long*)target.key.data;
     const F key_min = F(target.key_min);
+    auto marks = [&](I mask) -> unsigned {
+#if defined(__AVX__) && !defined(__AVX512F__)
+        return __builtin_ia32_movmskps256(__builtin_bit_cast(F, mask));
+#else
+        return bits(mask);
+#endif
+    };
+
+    // Without rays a fragment needs no memory but its key: rows of keys are worked on as they lie, LANES side by side.
+    const bool in_rows = !rays && width >= LANES;
+    // Keys as their halves, without a shuffle across 128 bits: lane l has the key `place(l)`.
+    auto place = [](int l) -> int { return (l & 1) + ((l >> 2) << 1) + ((l & 2) ? LANES / 2 : 0); };
+    I places;
+    EACH_LANE places[l] = place(l);
+#if defined(__AVX512F__)
+#define EVEN 0, 2, 16, 18, 4, 6, 20, 22, 8, 10, 24, 26, 12, 14, 28, 30
+#define ODD 1, 3, 17, 19, 5, 7, 21, 23, 9, 11, 25, 27, 13, 15, 29, 31
+#define FRONT 0, 16, 1, 17, 4, 20, 5, 21, 8, 24, 9, 25, 12, 28, 13, 29
+#define BACK 2, 18, 3, 19, 6, 22, 7, 23, 10, 26, 11, 27, 14, 30, 15, 31
+#else
+#define EVEN 0, 2, 8, 10, 4, 6, 12, 14
+#define ODD 1, 3, 9, 11, 5, 7, 13, 15
+#define FRONT 0, 8, 1, 9, 4, 12, 5, 13
+#define BACK 2, 10, 3, 11, 6, 14, 7, 15
+#endif
+    // `count` rows from row y of the target on, at the LANES columns from x on: edge functions with their biases, their steps
+    // from row to row, and depth of the row that many below the first from them. Gives a bit for each covered pixel.
+    auto draw_rows = [&](int x, int y, int count, I ea, I eb, I ec, I row_a, I row_b, I row_c, U low, auto depth_of)
+        __attribute__((always_inline)) -> unsigned long long {
+        unsigned long long* at = keys + y * width + x;
+        unsigned long long covered = 0;
+        for (int row = 0; row < count; ++row, at += width, ea += row_a, eb += row_b, ec += row_c) {
+            I inside = (ea | eb | ec) >= 0;
+            if (!marks(inside)) continue;
+            const F depth = depth_of(row, ea, eb, ec, inside);
+            inside &= depth > key_min;
+            if (masked) {
+                const int* mask = target.mask.data + (target.y0 + y + row) * target.mask_width + target.x0 + x;
+                inside &= igather(mask, places) == target.mask_value;
+            }
+            covered |= (unsigned long long)marks(inside) << LANES * row;
+            U a, b;
+            __builtin_memcpy(&a, at, sizeof(a));
+            __builtin_memcpy(&b, at + LANES / 2, sizeof(b));
+            U low_now = __builtin_shufflevector(a, b, EVEN), high_now = __builtin_shufflevector(a, b, ODD);
+            const F now = __builtin_bit_cast(F, high_now);
+            inside &= (depth > now) | ((depth == now) & (low > low_now));
+            if (!marks(inside)) continue;
+            low_now = inside ? low : low_now;
+            high_now = inside ? __builtin_bit_cast(U, depth) : high_now;
+            a = __builtin_shufflevector(low_now, high_now, FRONT);
+            b = __builtin_shufflevector(low_now, high_now, BACK);
+            __builtin_memcpy(at, &a, sizeof(a));
+            __builtin_memcpy(at + LANES / 2, &b, sizeof(b));
+        }
+        return covered;
+    };
+
+    // What hides what, per tile of 64 pixels: all its keys are at least `known`; those of `covered` at least `found`.
+    constexpr int TILE_ROWS = 64 / LANES;
+    struct Tile { float known, found; unsigned long long covered; };
+    Tile* tile_of = (Tile*)tiles.data;
+    const int tile_columns = (width + LANES - 1) / LANES;
+    auto cover = [&](Tile& tile, int y_tile, unsigned long long covered, float depth) {
+        if (covered == 0) return;
+        if (tile.covered == 0 || depth < tile.found) tile.found = depth;
+        tile.covered |= covered;
+        const int left = target.y1 - target.y0 - y_tile;
+        const unsigned long long all = left >= TILE_ROWS ? ~0ull : ~0ull >> LANES * (TILE_ROWS - left);
+        if (tile.covered != all) return;
+        if (tile.found > tile.known) tile.known = tile.found;
+        tile.covered = 0;
+    };
+    // Keys between which the depths of a triangle with these lie, as they are rounded.
+    auto above = [](auto key) { return key * 1.000001f + 1.0e-37f; };
+    auto below = [](auto key) { return key * 0.999999f - 1.0e-37f; };
 
     // Fragments of interpolated keys at cells, of triangles with these planes and, by owner, complements of their numbers;
     // raster.ray_key where there are rays.
@@ -89,45 +174,13 @@ _TARGET = r"""
     constexpr int LISTED = 256;  // fragments that are worked on together
     constexpr int ROWS_MAX = 66;  // of a box of 64 pixels, and one to read past
     constexpr int LIST_MAX = LISTED + ROWS_MAX * LANES;
-    auto marks = [&](I mask) -> unsigned {
-#if defined(__AVX__) && !defined(__AVX512F__)
-        return __builtin_ia32_movmskps256(__builtin_bit_cast(F, mask));
-#else
-        return bits(mask);
-#endif
-    };
-    // LANES keys of a row as their halves, without a shuffle across 128 bits: lane l has the key `place(l)`.
-    auto place = [](int l) -> int { return (l & 1) + ((l >> 2) << 1) + ((l & 2) ? LANES / 2 : 0); };
-    I places;
-    EACH_LANE places[l] = place(l);
-#if defined(__AVX512F__)
-#define EVEN 0, 2, 16, 18, 4, 6, 20, 22, 8, 10, 24, 26, 12, 14, 28, 30
-#define ODD 1, 3, 17, 19, 5, 7, 21, 23, 9, 11, 25, 27, 13, 15, 29, 31
-#define FRONT 0, 16, 1, 17, 4, 20, 5, 21, 8, 24, 9, 25, 12, 28, 13, 29
-#define BACK 2, 18, 3, 19, 6, 22, 7, 23, 10, 26, 11, 27, 14, 30, 15, 31
-#else
-#define EVEN 0, 2, 8, 10, 4, 6, 12, 14
-#define ODD 1, 3, 9, 11, 5, 7, 13, 15
-#define FRONT 0, 8, 1, 9, 4, 12, 5, 13
-#define BACK 2, 10, 3, 11, 6, 14, 7, 15
-#endif
-    auto split = [](const unsigned long long* p, U& low, U& high) {
-        U a, b;
-        __builtin_memcpy(&a, p, sizeof(a));
-        __builtin_memcpy(&b, p + LANES / 2, sizeof(b));
-        low = __builtin_shufflevector(a, b, EVEN);
-        high = __builtin_shufflevector(a, b, ODD);
-    };
-    auto join = [](unsigned long long* p, U low, U high) {
-        const U a = __builtin_shufflevector(low, high, FRONT), b = __builtin_shufflevector(low, high, BACK);
-        __builtin_memcpy(p, &a, sizeof(a));
-        __builtin_memcpy(p + LANES / 2, &b, sizeof(b));
+    // The most that an edge function grows by from the first pixel of a tile on.
+    auto over = [](I dx, I dy) -> I {
+        return (dx > 0 ? dx * (256 * (TILE_ROWS - 1)) : 0) - (dy < 0 ? dy * (256 * (LANES - 1)) : 0);
     };
     auto least = [](I p, I q) -> I { return p < q ? p : q; };
     auto most = [](I p, I q) -> I { return p > q ? p : q; };
     auto apart = [](V a, F s) -> V { return V{a.x / s, a.y / s, a.z / s}; };
-    // Without rays a fragment needs no memory but its key: rows of keys are worked on as they lie.
-    const bool in_rows = !rays && width >= LANES;
     const int* corner_of = (const int*)triangles.data;
     const int* plane_corner_of = (const int*)plane_triangles.data;
     const int* numbers = survivors.data + begin;
@@ -221,14 +274,22 @@ _TARGET = r"""
         const I px = ipick(drawn, left * 256 + 128, I(0)), py = ipick(drawn, top * 256 + 128, I(0));
         const F inv_area = 1.0f / __builtin_convertvector(area, F);
         // Of every triangle: edges at the first pixel, the largest that is outside, steps, and what is left of it.
-        enum { EA, EB, EC, OUT_A, OUT_B, OUT_C, DXA, DXB, DXC, DYA, DYB, DYC, COLUMN, COLUMNS, TOP, ROWS, CELL, FIELDS };
+        enum { EA, EB, EC, OUT_A, OUT_B, OUT_C, BIAS_A, BIAS_B, BIAS_C, OVER_A, OVER_B, OVER_C,
+            DXA, DXB, DXC, DYA, DYB, DYC, COLUMN, COLUMNS, ROW, ROWS, CELL, FIELDS };
         int field[FIELDS][LANES];
         istore(field[EA], dxa * (py - yb) - dya * (px - xb));
         istore(field[EB], dxb * (py - yc) - dyb * (px - xc));
         istore(field[EC], dxc * (py - ya) - dyc * (px - xa));
-        istore(field[OUT_A], -1 - edge_bias(dxa, dya));
-        istore(field[OUT_B], -1 - edge_bias(dxb, dyb));
-        istore(field[OUT_C], -1 - edge_bias(dxc, dyc));
+        const I bias[3] = {edge_bias(dxa, dya), edge_bias(dxb, dyb), edge_bias(dxc, dyc)};
+        istore(field[OUT_A], -1 - bias[0]);
+        istore(field[OUT_B], -1 - bias[1]);
+        istore(field[OUT_C], -1 - bias[2]);
+        istore(field[BIAS_A], bias[0]);
+        istore(field[BIAS_B], bias[1]);
+        istore(field[BIAS_C], bias[2]);
+        istore(field[OVER_A], bias[0] + over(dxa, dya));
+        istore(field[OVER_B], bias[1] + over(dxb, dyb));
+        istore(field[OVER_C], bias[2] + over(dxc, dyc));
         istore(field[DXA], dxa * 256);
         istore(field[DXB], dxb * 256);
         istore(field[DXC], dxc * 256);
@@ -237,7 +298,7 @@ _TARGET = r"""
         istore(field[DYC], dyc * 256);
         istore(field[COLUMN], left - target.x0);
         istore(field[COLUMNS], right - left);
-        istore(field[TOP], top);
+        istore(field[ROW], top - target.y0);
         istore(field[ROWS], bottom - top);
         istore(field[CELL], (top - target.y0) * width + left - target.x0);
         float keys_a[LANES], keys_b[LANES], keys_c[LANES], inverse[LANES];
@@ -245,6 +306,9 @@ _TARGET = r"""
         store(keys_b, kb);
         store(keys_c, kc);
         store(inverse, inv_area);
+        float most_key[LANES], least_key[LANES];
+        store(most_key, above(fmax(k[0], fmax(kb, kc))));
+        store(least_key, below(fmin(k[0], fmin(kb, kc))));
         istore(low_of + start, ~(ids.shape[0] > 0 ? igather(ids.data, t) : t + id_offset));
         if (rays) {
             // raster.triangle_plane
@@ -267,38 +331,42 @@ _TARGET = r"""
         }
         for (unsigned left_over = in_rows ? bits(drawn) : 0; left_over != 0; left_over &= left_over - 1) {
             const int l = __builtin_ctz(left_over);
-            const I step_a = I(field[DYA][l]), step_b = I(field[DYB][l]), step_c = I(field[DYC][l]);
-            const I row_a = I(field[DXA][l]), row_b = I(field[DXB][l]), row_c = I(field[DXC][l]);
-            const I bias_a = -1 - I(field[OUT_A][l]), bias_b = -1 - I(field[OUT_B][l]), bias_c = -1 - I(field[OUT_C][l]);
+            const int x_first = field[COLUMN][l], x_last = x_first + field[COLUMNS][l];
+            const int y_first = field[ROW][l], y_last = y_first + field[ROWS][l];
+            const int row_a = field[DXA][l], row_b = field[DXB][l], row_c = field[DXC][l];
+            const int step_a = field[DYA][l], step_b = field[DYB][l], step_c = field[DYC][l];
+            const I bias_a = I(field[BIAS_A][l]), bias_b = I(field[BIAS_B][l]), bias_c = I(field[BIAS_C][l]);
+            const I across_a = bias_a - places * step_a, across_b = bias_b - places * step_b;
+            const I across_c = bias_c - places * step_c;
             const F key_a = F(keys_a[l]), key_b = F(keys_b[l]), key_c = F(keys_c[l]), inv = F(inverse[l]);
-            const U low = U((unsigned)low_of[start + l]);
-            const int x_first = field[COLUMN][l], x_last = x_first + field[COLUMNS][l], rows = field[ROWS][l];
-            // From multiples of LANES on: what a triangle writes and the next one reads are the same words, which are
+            auto depth_of = [&](int row, I ea, I eb, I ec, I inside) __attribute__((always_inline)) -> F {
+                return (__builtin_convertvector(ea - bias_a, F) * key_a + __builtin_convertvector(eb - bias_b, F) * key_b
+                    + __builtin_convertvector(ec - bias_c, F) * key_c) * inv;
+            };
+            // From a multiple of LANES on: what a triangle writes and the next one reads are the same words, which are
             // handed on without waiting for memory. The last vector of a row ends with it.
-            for (int x = x_first & -LANES; x <= x_last; x += LANES) {
-                const int x_begin = x + LANES <= width ? x : width - LANES;
-                const I column = x_begin - x_first + places;
-                I ea = field[EA][l] + bias_a - column * step_a, eb = field[EB][l] + bias_b - column * step_b;
-                I ec = field[EC][l] + bias_c - column * step_c;
-                unsigned long long* row = keys + field[CELL][l] - x_first + x_begin;
-                for (int y = 0; y <= rows; ++y, row += width, ea += row_a, eb += row_b, ec += row_c) {
-                    I inside = (ea | eb | ec) >= 0;
-                    if (!marks(inside)) continue;
-                    const F depth = (__builtin_convertvector(ea - bias_a, F) * key_a
-                        + __builtin_convertvector(eb - bias_b, F) * key_b
-                        + __builtin_convertvector(ec - bias_c, F) * key_c) * inv;
-                    inside &= depth > key_min;
-                    if (masked) {
-                        const int* mask = target.mask.data
-                            + (field[TOP][l] + y) * target.mask_width + target.x0 + x_begin;
-                        inside &= igather(mask, places) == target.mask_value;
-                    }
-                    U low_now, high_now;
-                    split(row, low_now, high_now);
-                    const F now = __builtin_bit_cast(F, high_now);
-                    inside &= (depth > now) | ((depth == now) & (low > low_now));
-                    if (!marks(inside)) continue;
-                    join(row, inside ? low : low_now, inside ? __builtin_bit_cast(U, depth) : high_now);
+            auto columns_at = [&](int x) -> int { return x + LANES <= width ? x : width - LANES; };
+            auto draw_at = [&](int x, int y, int count) __attribute__((always_inline)) -> unsigned long long {
+                const int a = field[EA][l] + (y - y_first) * row_a - (x - x_first) * step_a;
+                const int b = field[EB][l] + (y - y_first) * row_b - (x - x_first) * step_b;
+                const int c = field[EC][l] + (y - y_first) * row_c - (x - x_first) * step_c;
+                if (((a + field[OVER_A][l]) | (b + field[OVER_B][l]) | (c + field[OVER_C][l])) < 0) return 0;
+                return draw_rows(x, y, count, a + across_a, b + across_b, c + across_c, I(row_a), I(row_b), I(row_c),
+                    U((unsigned)low_of[start + l]), depth_of);
+            };
+            if (y_last - y_first < TILE_ROWS && x_last - x_first < LANES) {
+                // So small that it is drawn sooner than looked for behind others.
+                for (int x = x_first & -LANES; x <= x_last; x += LANES)
+                    draw_at(columns_at(x), y_first, y_last - y_first + 1);
+                continue;
+            }
+            for (int y_tile = y_first & -TILE_ROWS; y_tile <= y_last; y_tile += TILE_ROWS) {
+                const int y = y_tile > y_first ? y_tile : y_first;
+                const int count = (y_tile + TILE_ROWS <= y_last ? y_tile + TILE_ROWS : y_last + 1) - y;
+                for (int x = x_first & -LANES; x <= x_last; x += LANES) {
+                    Tile& tile = tile_of[y_tile / TILE_ROWS * tile_columns + x / LANES];
+                    if (most_key[l] < tile.known) continue;
+                    cover(tile, y_tile, draw_at(columns_at(x), y, count) << LANES * (y - y_tile), least_key[l]);
                 }
             }
         }
@@ -367,6 +435,7 @@ def draw_block(
     guard: float,
     ray_along_min: float,
     ray_trust: float,
+    tiles: wp.array(dtype=wp.uint64),
 ) -> wp.uint64:
     """Draw those of `count` survivors that are small; a bit for each of the others."""
     ...
@@ -379,17 +448,6 @@ def draw_block(
     typedef double D __attribute__((ext_vector_type(LANES)));
     auto least = [](int p, int q) -> int { return p < q ? p : q; };
     auto most = [](int p, int q) -> int { return p > q ? p : q; };
-    // The same of LANES cells of a row, without rays and mask: without a branch, and without a masked store, which is slow.
-    auto put_row = [&](I inside, int cell, F depth, unsigned low) {
-        inside &= depth > key_min;
-        // Positive keys order as signed words too.
-        S now;
-        __builtin_memcpy(&now, keys + cell, sizeof(now));
-        const S key = (__builtin_convertvector(__builtin_bit_cast(U, depth), S) << 32) | (long long)low;
-        const S kept = __builtin_convertvector(inside, S) & (key > now);
-        now ^= (now ^ key) & kept;
-        __builtin_memcpy(keys + cell, &now, sizeof(now));
-    };
     const int xa = snap(F(a[0]))[0], ya = snap(F(a[1]))[0];
     int xb = snap(F(b[0]))[0], yb = snap(F(b[1]))[0], xc = snap(F(c[0]))[0], yc = snap(F(c[1]))[0];
     const float ka = a[2];
@@ -414,12 +472,71 @@ def draw_block(
     const long long ea0 = (long long)dxa * (py - yb) - (long long)dya * (px - xb);
     const long long eb0 = (long long)dxb * (py - yc) - (long long)dyb * (px - xc);
     const long long ec0 = (long long)dxc * (py - ya) - (long long)dyc * (px - xa);
-    const double bias_a = edge_bias(I(dxa), I(dya))[0], bias_b = edge_bias(I(dxb), I(dyb))[0];
-    const double bias_c = edge_bias(I(dxc), I(dyc))[0];
+    const int bias_a = edge_bias(I(dxa), I(dya))[0], bias_b = edge_bias(I(dxb), I(dyb))[0];
+    const int bias_c = edge_bias(I(dxc), I(dyc))[0];
     const float inv_area = 1.0f / (float)area;
+    const int low = ~triangle;
+    if (in_rows) {
+        const int x_first = left - target.x0, x_last = right - target.x0;
+        const int y_first = top - target.y0, y_last = bottom - target.y0;
+        // Steps are multiples of 256, so that the sign of an edge function is that of its whole part in those: within a tile
+        // that the edge crosses it has 32 bits, and elsewhere any number as large has its sign.
+        auto coarse = [](long long e) -> int {
+            e >>= 8;
+            return e > (1 << 30) ? 1 << 30 : e < -(1 << 30) ? -(1 << 30) : (int)e;
+        };
+        auto over = [](int dx, int dy) -> long long {
+            return (dx > 0 ? 256LL * (TILE_ROWS - 1) * dx : 0) - (dy < 0 ? 256LL * (LANES - 1) * dy : 0);
+        };
+        const long long over_a = over(dxa, dya), over_b = over(dxb, dyb), over_c = over(dxc, dyc);
+        const I across_a = places * dya, across_b = places * dyb, across_c = places * dyc;
+        const D wide = __builtin_convertvector(places, D);
+        const D wide_a = wide * (dya * 256.0), wide_b = wide * (dyb * 256.0), wide_c = wide * (dyc * 256.0);
+        const double over_area = 1.0 / (double)area;
+        const double x_slope = -256.0 * ((double)dya * ka + (double)dyb * kb + (double)dyc * kc) * over_area;
+        const double y_slope = 256.0 * ((double)dxa * ka + (double)dxb * kb + (double)dxc * kc) * over_area;
+        // With what the slopes lose where a sliver's terms cancel.
+        auto magnitude = [&](double a, double b, double c) -> double {
+            return (__builtin_fabs(a) * ka + __builtin_fabs(b) * kb + __builtin_fabs(c) * kc) * over_area * 1.0e-14;
+        };
+        const double rise = (x_slope > 0.0 ? x_slope * (LANES - 1) : 0.0) + (y_slope > 0.0 ? y_slope * (TILE_ROWS - 1) : 0.0)
+            + 256.0 * (LANES * magnitude(dya, dyb, dyc) + TILE_ROWS * magnitude(dxa, dxb, dxc));
+        const float most_key = ka > kb ? (ka > kc ? ka : kc) : (kb > kc ? kb : kc);
+        for (int y_tile = y_first & -TILE_ROWS; y_tile <= y_last; y_tile += TILE_ROWS) {
+            const int y = y_tile > y_first ? y_tile : y_first;
+            const int count = (y_tile + TILE_ROWS <= y_last ? y_tile + TILE_ROWS : y_last + 1) - y;
+            for (int x = x_first & -LANES; x <= x_last; x += LANES) {
+                const int x_begin = x + LANES <= width ? x : width - LANES;
+                const long long right_of = 256LL * (x_begin - x_first), under = 256LL * (y - y_first);
+                const long long ea = ea0 + under * dxa - right_of * dya, eb = eb0 + under * dxb - right_of * dyb;
+                const long long ec = ec0 + under * dxc - right_of * dyc;
+                if (((ea + bias_a + over_a) | (eb + bias_b + over_b) | (ec + bias_c + over_c)) < 0) continue;
+                Tile& tile = tile_of[y_tile / TILE_ROWS * tile_columns + x / LANES];
+                const double nearest = ((double)ea * ka + (double)eb * kb + (double)ec * kc) * over_area
+                    + magnitude(ea, eb, ec) + rise;
+                if (above((float)(nearest < most_key ? nearest : most_key)) < tile.known) continue;
+                F found = F(__builtin_inff());
+                auto depth_of = [&](int row, I, I, I, I inside) __attribute__((always_inline)) -> F {
+                    const double down = 256.0 * row;
+                    const F a = __builtin_convertvector((double)ea + down * dxa - wide_a, F);
+                    const F b = __builtin_convertvector((double)eb + down * dxb - wide_b, F);
+                    const F c = __builtin_convertvector((double)ec + down * dxc - wide_c, F);
+                    const F depth = (a * ka + b * kb + c * kc) * inv_area;
+                    found = pick(inside & (depth < found), depth, found);
+                    return depth;
+                };
+                const unsigned long long covered = draw_rows(x_begin, y, count, coarse(ea + bias_a) - across_a,
+                    coarse(eb + bias_b) - across_b, coarse(ec + bias_c) - across_c, I(dxa), I(dxb), I(dxc),
+                    U((unsigned)low), depth_of);
+                float least = found[0];
+                EACH_LANE least = found[l] < least ? found[l] : least;
+                cover(tile, y_tile, covered << LANES * (y - y_tile), least);
+            }
+        }
+        return;
+    }
     const V n = spread(plane.n);
     const F offset = F(plane.offset);
-    const int low = ~triangle;
     typedef decltype(D() < D()) Wide;
     const D lane = __builtin_convertvector(lanes(), D);
     const double xstep_a = dya * 256.0, xstep_b = dyb * 256.0, xstep_c = dyc * 256.0;
@@ -429,19 +546,15 @@ def draw_block(
         D ea = ea_row, eb = eb_row, ec = ec_row;
         const int cell = (y - target.y0) * width - target.x0;
         for (int x = left; x <= right; x += LANES) {
-            const Wide within = (ea + bias_a >= 0.0) & (eb + bias_b >= 0.0) & (ec + bias_c >= 0.0);
+            const Wide within = (ea + (double)bias_a >= 0.0) & (eb + (double)bias_b >= 0.0) & (ec + (double)bias_c >= 0.0);
             const I column = x + lanes();
             I inside = __builtin_convertvector(within, I) & (column <= right);
             if (bits(inside)) {
                 const F depth = (__builtin_convertvector(ea, F) * ka + __builtin_convertvector(eb, F) * kb
                     + __builtin_convertvector(ec, F) * kc) * inv_area;
-                if (!rays && !masked && x + LANES <= target.x1) {
-                    put_row(inside, cell + x, depth, ~(unsigned)triangle);
-                } else {
-                    const I inner = column < target.x1 ? column : I(target.x1 - 1);
-                    if (masked) inside &= igather(target.mask.data, y * target.mask_width + inner) == target.mask_value;
-                    put(inside, cell + inner, depth, n, offset, I(0), &low);
-                }
+                const I inner = column < target.x1 ? column : I(target.x1 - 1);
+                if (masked) inside &= igather(target.mask.data, y * target.mask_width + inner) == target.mask_value;
+                put(inside, cell + inner, depth, n, offset, I(0), &low);
             }
             ea -= xstep_a * LANES;
             eb -= xstep_b * LANES;
@@ -465,6 +578,7 @@ def draw_large(
     row_end: int,
     ray_along_min: float,
     ray_trust: float,
+    tiles: wp.array(dtype=wp.uint64),
 ): ...
 
 
@@ -481,6 +595,7 @@ def draw_blocks_kernel(
     survivor_count: wp.array(dtype=int),
     points: wp.array(dtype=wp.vec3),
     plane_triangles: wp.array(dtype=wp.vec3i),
+    tiles: wp.array(dtype=wp.uint64),
     row_first: int,
     row_end: int,
 ):
@@ -504,6 +619,7 @@ def draw_blocks_kernel(
         GUARD,
         RAY_ALONG_MIN,
         RAY_TRUST,
+        tiles,
     )
     i = begin
     while left != wp.uint64(0):
@@ -538,6 +654,7 @@ def draw_blocks_kernel(
                     row_end,
                     RAY_ALONG_MIN,
                     RAY_TRUST,
+                    tiles,
                 )
         left = left >> wp.uint64(1)
         i += 1
