@@ -1,6 +1,7 @@
 """Vector kernels against the plain ones: the same bits, on every shape of triangle and on every scene."""
 
 import dataclasses
+import itertools
 from types import SimpleNamespace
 
 import numpy as np
@@ -54,13 +55,19 @@ def drawn(kernels, screen, triangles, width, height, rays=None, mask=None, point
 def corners_of(kind, rng, count, width, height):
     """Screen corners float32 [3 * count, 4]: x, y, depth key, 1 / w."""
     middle = rng.uniform((0, 0), (width, height), (count, 1, 2))
-    size = {"tiny": 0.7, "small": 12.0, "edge": 64.0, "large": 900.0}[kind]
+    size = {"tiny": 0.7, "small": 12.0, "edge": 64.0, "large": 900.0, "sliver": 15000.0}[kind]
     xy = middle + rng.uniform(-size, size, (count, 3, 2))
     if kind == "edge":
         # Boxes of exactly 64 pixels and a little either side, and corners on pixel centres and borders.
         xy = np.round(xy * 2.0) / 2.0
         xy[:, 1] = xy[:, 0] + rng.choice([63.5, 64.0, 64.5], (count, 2)) * rng.choice([-1, 1], (count, 2))
     key = rng.uniform(0.01, 1.0, (count, 3, 1))
+    if kind == "sliver":
+        # A few of the raster's positions wide, through the picture, with depths decades apart.
+        share = rng.uniform(-1.0, 1.0, (count, 1))
+        xy[:, 1] = middle[:, 0] - share * (xy[:, 0] - middle[:, 0]) + rng.uniform(-0.6, 0.6, (count, 2))
+        xy[:, 2] = middle[:, 0] + rng.uniform(-30.0, 30.0, (count, 2)) * rng.choice([0.02, 1.0], (count, 1))
+        key **= 4.0
     return np.concatenate([xy, key, np.ones((count, 3, 1))], -1).reshape(-1, 4).astype(np.float32)
 
 
@@ -71,7 +78,7 @@ def test_this_machine_has_vector_kernels_or_says_why():
     assert not vector.chosen("plain", CPU)
 
 
-@pytest.mark.parametrize("kind", ["tiny", "small", "edge", "large"])
+@pytest.mark.parametrize("kind", ["tiny", "small", "edge", "large", "sliver"])
 @pytest.mark.parametrize("size", [(7, 5), (131, 97)])
 def test_triangles_are_drawn_bit_for_bit_as_the_plain_kernel_draws_them(kind, size):
     rng = np.random.default_rng(len(kind))
@@ -102,6 +109,33 @@ def test_masks_and_rays_are_honoured_bit_for_bit(kind, with_rays):
     plain = drawn("plain", *args)
     assert (plain > 0).any() and not plain.reshape(height, width)[mask == 0].any()
     np.testing.assert_array_equal(drawn("vector", *args), plain)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_what_is_left_out_behind_others_is_hidden_by_them(seed):
+    """Layers of every size, each behind the one before it but for depths that touch, drawn once over the other."""
+    rng = np.random.default_rng(seed)
+    width, height = 157, 83
+    parts = [
+        corners_of(kind, rng, count, width, height) for kind, count in (("small", 3000), ("large", 60), ("edge", 400))
+    ]
+    screen = np.concatenate(parts).reshape(-1, 3, 4)
+    screen[:, :, 2] = rng.choice([0.1, 0.1000001, 0.2, 0.4], (len(screen), 1))
+    screen[::3, :, 2] *= rng.uniform(0.999999, 1.000001, (len(screen[::3]), 3))
+    triangles = np.arange(3 * len(screen), dtype=np.int32).reshape(-1, 3)
+    screen = screen.reshape(-1, 4).astype(np.float32)
+    plain = drawn("plain", screen, triangles, width, height)
+    assert (plain > 0).all()
+    for threads in (1, 3):
+        np.testing.assert_array_equal(drawn("vector", screen, triangles, width, height, threads=threads), plain)
+
+
+def test_bands_of_rows_have_whole_tiles():
+    for first, end, count in ((0, 720, 2), (3, 94, 5), (0, 5, 8), (2, 9, 2)):
+        bands = raster.row_bands(first, end, count)
+        assert bands[0][0] == first and bands[-1][1] == end
+        assert all(a[1] == b[0] for a, b in itertools.pairwise(bands))
+        assert all((begin - first) % 8 == 0 and begin < stop for begin, stop in bands)
 
 
 def rays_of(rng, count):
