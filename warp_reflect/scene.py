@@ -263,17 +263,19 @@ class PatchView:
 
 @wp.struct
 class MaterialView:
+    # As in `textures.Look`, so that vectors read rows of either:
     base_color: wp.vec3
     f0: wp.vec3  # mirror weight at normal incidence
     f90: wp.vec3
     emissive: wp.vec3
-    metallic: float
     roughness: float
     clearcoat: float
     clearcoat_roughness: float
     clearcoat_f0: float
     opacity: float
     transmission: float
+    # And what becomes of them with a colour of the mesh or of a texture:
+    metallic: float
     uses_vertex_color: int
     specular_workflow: int
 

@@ -22,8 +22,6 @@ wp.set_module_options({"enable_backward": False})
 @wp.func_native(
     vector.snippet(
         r"""
-// A loop over lanes that is kept one: unrolled, the reads of some thirty fields of 16 lanes would take seconds to compile.
-#define SLOWLY _Pragma("clang loop unroll(disable)")
     const float pi = 3.14159265358979f;
     const int count = triangle.shape[0];
     const int begin = block * BLOCK;
@@ -93,23 +91,21 @@ wp.set_module_options({"enable_backward": False})
         return total;
     };
     struct Lit { V base, mirror; };
-    // What lanes `seen` of points `own` on triangles `tri` give back along unit rays: base radiance and weight of the mirror
-    // term, whose direction is left in `onward`. `weights` gives u and v, and is asked only where they matter.
-    auto lit = [&](I seen, I own, I tri, V ray, I reflector, const auto& weights, V& onward) -> Lit {
+    // What lanes `seen` of points `own`, from `start` on, on triangles `tri` give back along unit rays: base radiance and
+    // weight of the mirror term, whose direction is left in `onward`. `weights` gives u and v, and is asked only where they
+    // matter.
+    auto lit = [&](I seen, int start, bool full, I own, I tri, V ray, I reflector, const auto& weights, V& onward) -> Lit {
         V p0, p1, p2;
         corners(records.data, tri, p0, p1, p2);
         const I patch = igather(scene.triangle_patch.data, tri);
-        // One patch for all lanes, or for each its own: then their fields are turned into rows of a table first.
+        // One patch for all lanes, or for each its own.
         const bool alone = !bits(patch != patch[0]);
         const auto* patches = scene.patches.data;
-        int patch_of[LANES], shapes[LANES], material_of[LANES];
-        istore(patch_of, patch);
-        SLOWLY for (int l = 0; l < LANES; ++l) {
-            const auto& each = patches[patch_of[l]];
-            shapes[l] = each.shape;
-            material_of[l] = each.material;
-        }
-        const I shape = iload(shapes);
+        constexpr int patch_words = sizeof(*patches) / 4;
+        const auto of_patch = [&](const int* first) -> I {
+            return alone ? I(first[patch_words * patch[0]]) : igather(first, patch_words * patch);
+        };
+        const I shape = of_patch(&patches->shape), material = of_patch(&patches->material);
         const int* normal_index = (const int*)scene.normal_index.data;
         const I first_normal = igather(normal_index, 3 * tri);
         const I smooth = first_normal >= 0;
@@ -132,29 +128,33 @@ wp.set_module_options({"enable_backward": False})
         }
         const V p = add(add(times(w, p0), times(u, p1)), times(v, p2));
         if (bits(seen & quadric)) {
-            float rows[14 * LANES];
-            const int unlike = alone ? 1 : LANES;
-            SLOWLY for (int l = 0; l < unlike; ++l) {
-                const auto& each = patches[patch_of[l]];
-                for (int k = 0; k < 12; ++k) rows[k * LANES + l] = each.unit_from_scene.data[k / 4][k % 4];
-                rows[12 * LANES + l] = each.quadric[0];
-                rows[13 * LANES + l] = each.quadric[1];
-            }
-            if (alone) SLOWLY for (int k = 0; k < 14; ++k) store(rows + k * LANES, F(rows[k * LANES]));
+            // A patch's fields as floats: its matrix by rows, then the quadric's first two numbers.
+            const float* matrix = &patches->unit_from_scene.data[0][0];
+            const float* quadrics = (const float*)&patches->quadric;
             V row[3];
-            F shift[3];
-            _Pragma("clang loop unroll(full)") for (int k = 0; k < 3; ++k) {
-                const float* from = rows + 4 * k * LANES;
-                row[k] = V{load(from), load(from + LANES), load(from + 2 * LANES)};
-                shift[k] = load(from + 3 * LANES);
+            F shift[3], a, b;
+            if (alone) {
+                const float* from = matrix + patch_words * patch[0];
+                _Pragma("clang loop unroll(full)") for (int k = 0; k < 3; ++k) {
+                    row[k] = V{F(from[4 * k]), F(from[4 * k + 1]), F(from[4 * k + 2])};
+                    shift[k] = F(from[4 * k + 3]);
+                }
+                a = F(quadrics[patch_words * patch[0]]); b = F(quadrics[patch_words * patch[0] + 1]);
+            } else {
+                F first[8], last[8];
+                gather8(matrix, patch_words * patch, first);
+                gather8(matrix, patch_words * patch + 4, last);
+                row[0] = V{first[0], first[1], first[2]}; shift[0] = first[3];
+                row[1] = V{first[4], first[5], first[6]}; shift[1] = first[7];
+                row[2] = V{last[4], last[5], last[6]}; shift[2] = last[7];
+                a = gather(quadrics, patch_words * patch); b = gather(quadrics + 1, patch_words * patch);
             }
-            const F a = load(rows + 12 * LANES), b = load(rows + 13 * LANES);
             const F x = dot(row[0], p) + shift[0], y = dot(row[1], p) + shift[1];
             const F z = a * (dot(row[2], p) + shift[2]) + 0.5f * b;
             n = vpick(quadric, unit(add(add(times(x, row[0]), times(y, row[1])), times(z, row[2]))), n);
         }
         if (normals.shape[0] > 0) {
-            const V mapped = vgather((const float*)normals.data, own);
+            const V mapped = vrows((const float*)normals.data, start, full, own);
             n = vpick(dot(mapped, mapped) > 0.0f, mapped, n);
         }
         const F along = dot(n, ray);
@@ -163,49 +163,31 @@ wp.set_module_options({"enable_backward": False})
         const F cosine = __builtin_elementwise_abs(along);
 
         // textures.plain_look, or what was looked up before.
-        float field[20 * LANES];
         const bool looked_up = looks.shape[0] > 0;
-        int own_of[LANES];
-        istore(own_of, own);
-        const int different = alone && !looked_up ? 1 : LANES;
-        SLOWLY for (int l = 0; l < different; ++l) {
-            auto fill = [&](const auto& look) {
-                for (int k = 0; k < 3; ++k) {
-                    field[k * LANES + l] = look.base_color[k];
-                    field[(3 + k) * LANES + l] = look.f0[k];
-                    field[(6 + k) * LANES + l] = look.f90[k];
-                    field[(9 + k) * LANES + l] = look.emissive[k];
-                }
-                field[12 * LANES + l] = look.roughness;
-                field[13 * LANES + l] = look.clearcoat;
-                field[14 * LANES + l] = look.clearcoat_roughness;
-                field[15 * LANES + l] = look.clearcoat_f0;
-                field[16 * LANES + l] = look.opacity;
-                field[17 * LANES + l] = look.transmission;
-            };
-            if (looked_up) {
-                fill(looks.data[own_of[l]]);
-                continue;
-            }
-            const auto& material = scene.materials.data[material_of[l]];
-            fill(material);
-            field[18 * LANES + l] = material.metallic;
-            field[19 * LANES + l] = (float)material.uses_vertex_color;
+        const auto* materials = scene.materials.data;
+        constexpr int look_words = sizeof(*looks.data) / 4, material_words = sizeof(*materials) / 4;
+        static_assert(look_words == 18, "a look is what is read here");
+        const float* table = looked_up ? (const float*)looks.data : (const float*)materials;
+        const I at = looked_up ? look_words * own : material_words * material;
+        F field[18];
+        if (!bits(at != at[0])) {
+            _Pragma("clang loop unroll(full)") for (int k = 0; k < 18; ++k) field[k] = F(table[at[0] + k]);
+        } else {
+            F last[8];
+            gather8(table, at, field);
+            gather8(table, at + 8, field + 8);
+            gather8(table, at + 10, last);
+            field[16] = last[6]; field[17] = last[7];
         }
-        if (different == 1) SLOWLY for (int k = 0; k < 20; ++k) store(field + k * LANES, F(field[k * LANES]));
-        auto vector_at = [&](int k) -> V {
-            return V{load(field + k * LANES), load(field + (k + 1) * LANES), load(field + (k + 2) * LANES)};
-        };
-        V base_color = vector_at(0), f0 = vector_at(3), f90 = vector_at(6);
-        const V emissive = vector_at(9);
-        const F roughness = load(field + 12 * LANES), clearcoat = load(field + 13 * LANES);
-        const F clearcoat_roughness = load(field + 14 * LANES), clearcoat_f0 = load(field + 15 * LANES);
-        const F opacity = load(field + 16 * LANES), through = load(field + 17 * LANES);
+        V base_color = V{field[0], field[1], field[2]};
+        V f0 = V{field[3], field[4], field[5]}, f90 = V{field[6], field[7], field[8]};
+        const V emissive = V{field[9], field[10], field[11]};
+        const F roughness = field[12], clearcoat = field[13], clearcoat_roughness = field[14], clearcoat_f0 = field[15];
+        const F opacity = field[16], through = field[17];
         if (colored) {
             const int* color_index = (const int*)scene.color_index.data;
             const I first_color = igather(color_index, 3 * tri);
-            const F uses = load(field + 19 * LANES);
-            const I has = (first_color >= 0) & (uses != 0.0f);
+            const I has = (first_color >= 0) & (igather(&materials->uses_vertex_color, at) != 0);
             if (bits(seen & has)) {
                 const float* all = (const float*)scene.colors.data;
                 const V c0 = vgather(all, ipick(has, first_color, I(0)));
@@ -213,7 +195,7 @@ wp.set_module_options({"enable_backward": False})
                 const V c2 = vgather(all, ipick(has, igather(color_index, 3 * tri + 2), I(0)));
                 const V mixed = add(add(times(w, c0), times(u, c1)), times(v, c2));
                 base_color = vpick(has, mixed, base_color);
-                const F metallic = load(field + 18 * LANES);
+                const F metallic = gather(&materials->metallic, at);
                 const I metal = has & (metallic > 0.0f);
                 const V tint = times(metallic, mixed);
                 f0 = vpick(metal, add(grey((1.0f - metallic) * clearcoat_f0), tint), f0);
@@ -236,9 +218,9 @@ wp.set_module_options({"enable_backward": False})
                 e = add(e, times(n.z * n.z, spread(lights.e_zz)));
                 total = add(total, V{fmax(e.x, F(0.0f)), fmax(e.y, F(0.0f)), fmax(e.z, F(0.0f))});
             }
-            if (sky.shape[0] > 0) total = times(gather(sky.data, own), total);
+            if (sky.shape[0] > 0) total = times(frow(sky.data, start, full, own), total);
             if (direct.shape[0] > 0) {
-                total = add(total, vgather((const float*)direct.data, own));
+                total = add(total, vrows((const float*)direct.data, start, full, own));
             } else {
                 for (int k = 0; k < lights.direct.distant.shape[0]; ++k) {
                     const auto& light = lights.direct.distant.data[k];
@@ -283,12 +265,13 @@ wp.set_module_options({"enable_backward": False})
     for (int start = begin; start < end; start += LANES) {
         const I element = start + lanes();
         const I own = ipick(element < end, element, I(end - 1));
-        const I tri = igather(triangle.data, own);
+        const bool full = start + LANES <= end;
+        const I tri = irow(triangle.data, start, full, own);
         const I seen = tri >= 0;
         I reflector = I(0);
         V plane, ray, incident;
         if (of_eye != 0) {
-            reflector = igather(reflector_id.data, own) > 0;
+            reflector = irow(reflector_id.data, start, full, own) > 0;
             const int first_row = start / camera.width;
             const bool one_row = own[LANES - 1] < (first_row + 1) * camera.width;
             const I row = one_row ? I(first_row) : own / camera.width;
@@ -298,12 +281,12 @@ wp.set_module_options({"enable_backward": False})
             ray = parallel ? spread(camera.forward) : plane;
             incident = unit(ray);
         } else {
-            plane = ray = incident = vgather((const float*)direction.data, own);
+            plane = ray = incident = vrows((const float*)direction.data, start, full, own);
         }
         auto weights = [&](V p0, V p1, V p2, F& u, F& v) {
             if (of_eye == 0) {
-                u = gather(weight_u.data, own);
-                v = gather(weight_v.data, own);
+                u = frow(weight_u.data, start, full, own);
+                v = frow(weight_v.data, start, full, own);
                 return;
             }
             // shade.weights_seen
@@ -325,28 +308,29 @@ wp.set_module_options({"enable_backward": False})
         V onward = incident;
         if (bits(seen)) {
             V reflected;
-            const Lit found = lit(seen, own, ipick(seen, tri, I(0)), incident, reflector, weights, reflected);
+            const Lit found = lit(seen, start, full, own, ipick(seen, tri, I(0)), incident, reflector, weights, reflected);
             shown = Lit{vpick(seen, found.base, shown.base), vpick(seen, found.mirror, shown.mirror)};
             onward = vpick(seen, reflected, onward);
         }
         const I dome = ~reflector & (size(shown.mirror) > 0.0f);
         V base = shown.base;
         if (bits(dome)) base = vpick(dome, add(base, product(shown.mirror, dome_radiance(dome, onward))), base);
-        // Three or four floats a lane, turned into rows by way of the stack.
-        float rows[7 * LANES];
-        store(rows, base.x); store(rows + LANES, base.y); store(rows + 2 * LANES, base.z);
-        const int whole = end - start < LANES ? end - start : LANES;
-        if (of_eye == 0) {
-            SLOWLY for (int l = 0; l < whole; ++l)
-                for (int k = 0; k < 3; ++k) radiance[3 * (start + l) + k] = rows[k * LANES + l];
-            continue;
-        }
         const V weight = vpick(reflector, shown.mirror, same(0.0f));
-        store(rows + 3 * LANES, pick(seen, F(1.0f), F(0.0f)));
-        store(rows + 4 * LANES, weight.x); store(rows + 5 * LANES, weight.y); store(rows + 6 * LANES, weight.z);
-        SLOWLY for (int l = 0; l < whole; ++l) {
-            for (int k = 0; k < 4; ++k) picture[4 * (start + l) + k] = rows[k * LANES + l];
-            for (int k = 0; k < 3; ++k) mirror[3 * (start + l) + k] = rows[(4 + k) * LANES + l];
+        const F covered = pick(seen, F(1.0f), F(0.0f));
+        if (of_eye == 0 && full) {
+            vstore(radiance, start, base);
+        } else if (full) {
+            vstore4(picture, start, base, covered);
+            vstore(mirror, start, weight);
+        } else {
+            for (int l = 0; l < end - start; ++l) {
+                const int i = start + l;
+                float* of_base = of_eye == 0 ? radiance + 3 * i : picture + 4 * i;
+                of_base[0] = base.x[l]; of_base[1] = base.y[l]; of_base[2] = base.z[l];
+                if (of_eye == 0) continue;
+                of_base[3] = covered[l];
+                mirror[3 * i] = weight.x[l]; mirror[3 * i + 1] = weight.y[l]; mirror[3 * i + 2] = weight.z[l];
+            }
         }
     }
 """

@@ -136,6 +136,12 @@ BLOCK = wp.constant(vector.BLOCK)
         const V d = sub(incident, times(2.0f * dot(incident, n), n));
         const V direction = times(1.5f - 0.5f * dot(d, d), d);
         unanswered |= (unsigned long long)bits(valid & ~good) << (start - begin);
+        if (bits(good) == bits(I(-1))) {
+            vstore(points, start, p);
+            vstore(normals, start, n);
+            vstore(directions, start, direction);
+            continue;
+        }
         for (unsigned left = bits(good); left != 0; left &= left - 1) {
             const int l = __builtin_ctz(left);
             const int i = 3 * (start + l);

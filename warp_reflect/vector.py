@@ -184,12 +184,45 @@ _HEAD = r"""
         __builtin_memcpy(p + 3 * start + 16, &c, sizeof(c));
 #endif
     };
+    // Four floats an element, of which v has the first three.
+    auto vstore4 = [](float* p, int start, V v, F w) {
+#if defined(__AVX512F__)
+        EACH_LANE { float* q = p + 4 * (start + l); q[0] = v.x[l]; q[1] = v.y[l]; q[2] = v.z[l]; q[3] = w[l]; }
+#else
+        const F xy = __builtin_shufflevector(v.x, v.y, 0, 8, 1, 9, 4, 12, 5, 13);
+        const F XY = __builtin_shufflevector(v.x, v.y, 2, 10, 3, 11, 6, 14, 7, 15);
+        const F zw = __builtin_shufflevector(v.z, w, 0, 8, 1, 9, 4, 12, 5, 13);
+        const F ZW = __builtin_shufflevector(v.z, w, 2, 10, 3, 11, 6, 14, 7, 15);
+        // Elements 0 and 4, 1 and 5, 2 and 6, 3 and 7.
+        const F a = __builtin_shufflevector(xy, zw, 0, 1, 8, 9, 4, 5, 12, 13);
+        const F b = __builtin_shufflevector(xy, zw, 2, 3, 10, 11, 6, 7, 14, 15);
+        const F c = __builtin_shufflevector(XY, ZW, 0, 1, 8, 9, 4, 5, 12, 13);
+        const F d = __builtin_shufflevector(XY, ZW, 2, 3, 10, 11, 6, 7, 14, 15);
+        const F rows[4] = {
+            __builtin_shufflevector(a, b, 0, 1, 2, 3, 8, 9, 10, 11), __builtin_shufflevector(c, d, 0, 1, 2, 3, 8, 9, 10, 11),
+            __builtin_shufflevector(a, b, 4, 5, 6, 7, 12, 13, 14, 15), __builtin_shufflevector(c, d, 4, 5, 6, 7, 12, 13, 14, 15)};
+        __builtin_memcpy(p + 4 * start, rows, sizeof(rows));
+#endif
+    };
     // The same of what may end before: then the lanes' own numbers count.
     auto vrows = [vload, vgather](const float* p, int start, bool full, I own) -> V {
         return full ? vload(p, start) : vgather(p, own);
     };
-    // Corners of triangles, from `Scene.triangle_records`.
-    auto corners = [gather8](const float* records, I triangle, V& p0, V& p1, V& p2) {
+    auto frow = [load, gather](const float* p, int start, bool full, I own) -> F {
+        return full ? load(p + start) : gather(p, own);
+    };
+    auto irow = [iload, igather](const int* p, int start, bool full, I own) -> I {
+        return full ? iload(p + start) : igather(p, own);
+    };
+    // Corners of triangles, from `Scene.triangle_records`. Neighbours in a picture often lie on the same.
+    auto corners = [gather8, bits](const float* records, I triangle, V& p0, V& p1, V& p2) {
+        if (!bits(triangle != triangle[0])) {
+            const float* p = records + 12 * triangle[0];
+            p0 = V{F(p[0]), F(p[1]), F(p[2])};
+            p1 = V{F(p[3]), F(p[4]), F(p[5])};
+            p2 = V{F(p[6]), F(p[7]), F(p[8])};
+            return;
+        }
         F corner[8], corner_z;
         const I at = 12 * triangle;
         gather8(records, at, corner);
@@ -201,7 +234,7 @@ _HEAD = r"""
     (void)bits; (void)lanes; (void)pick; (void)ipick; (void)fmin; (void)fmax; (void)sub; (void)add; (void)dot; (void)cross;
     (void)load; (void)iload; (void)store; (void)istore; (void)gather; (void)igather; (void)vgather; (void)halves; (void)gather8;
     (void)product; (void)vpick; (void)same; (void)grey; (void)spread; (void)clip; (void)unit; (void)corners; (void)facet_normal;
-    (void)vload; (void)vstore; (void)vrows;
+    (void)vload; (void)vstore; (void)vstore4; (void)vrows; (void)frow; (void)irow;
 """
 
 
