@@ -106,6 +106,20 @@ _CONSTANTS = f"""
             for (int row = 0; row < TILE_HEIGHT; ++row) {
                 row_start[row] = at[row];
                 at[row] = end[row];
+                // The rays beside it and their answers' places are fetched while these are on their way.
+                if (end[row] == stop[row]) continue;
+                const int next = end[row];
+                for (int line = 0; line < 32; line += 16) {
+                    __builtin_prefetch(points + 3 * next + line);
+                    __builtin_prefetch(normals + 3 * next + line);
+                    __builtin_prefetch(directions + 3 * next + line);
+                }
+                __builtin_prefetch(facets.data + (pixel.shape[0] > 0 ? pixel.data[next] : next));
+                __builtin_prefetch(out_triangle.data + next, 1);
+                __builtin_prefetch(out_u.data + next, 1);
+                __builtin_prefetch(out_v.data + next, 1);
+                __builtin_prefetch(out_t.data + next, 1);
+                __builtin_prefetch(out_status.data + next, 1);
             }
             taken = RAYS;
             return;
