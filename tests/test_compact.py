@@ -59,3 +59,17 @@ def test_pixels_sorted_by_id_are_those_found_one_by_one(kind, wanted, device):
     for id, (pixel, box) in found.items():
         np.testing.assert_array_equal(pixel.numpy(), expected[id])
         assert box == pixel_bounds(expected[id], width)
+
+
+def test_what_is_not_black_is_listed_and_everything_counted(device):
+    values = np.random.default_rng(2).random((500, 3)).astype(np.float32)
+    values[::3] = 0.0
+    values[1::3, 1:] = 0.0
+    given = wp.array(values, dtype=wp.vec3, device=device)
+    marks = wp.array((values[:, 2] > 0.5).astype(np.uint8), dtype=wp.uint8, device=device)
+    for way in (launch.as_device, launch.recorded):
+        with way():
+            found, numbers, count = compact.positive(given), compact.every(500, device), compact.counted(marks, 1)
+        np.testing.assert_array_equal(found.numpy(), np.flatnonzero(values.any(axis=1)))
+        np.testing.assert_array_equal(numbers.numpy(), np.arange(500))
+        assert count.numpy().tolist() == [(values[:, 2] > 0.5).sum()]

@@ -11,12 +11,11 @@ reflection is any technique's, and only reflectors are followed, what is merely 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from functools import cached_property
 
 import numpy as np
 import warp as wp
 
-from warp_reflect import bvh, launch, shade
+from warp_reflect import bvh, compact, launch, shade
 from warp_reflect.counts import add_statistics
 from warp_reflect.layers import GBuffer, MirrorPixels, ReflectionLayer, Reflector, meeting
 from warp_reflect.normal_maps import prepare_normals
@@ -45,9 +44,12 @@ class Mirrors:
         for reflector in self._reflectors:
             self.patches[list(scene.parts[reflector.part].patches)] = True
 
-    @cached_property
+    @property
     def bodies(self) -> wp.array:
         """`bvh.OwnBody` of every patch, without triangles where it is no reflector's."""
+        return self._scene.kept("bodies of mirrors", self._reflectors, self._bodies)
+
+    def _bodies(self) -> wp.array:
         # By columns: to make a structure for each of some thousand patches takes as long as a small picture.
         scene, bodies = self._scene, np.zeros(len(self.patches), bvh.OwnBody.numpy_dtype())
         for reflector in self._reflectors:
@@ -81,6 +83,8 @@ def reflect_hits_kernel(
     """One thread per asked ray: its reflection at the mirror that it met, and what the domes gave there; weight 0: too dark."""
     k = first + wp.tid()
     i = index[k]
+    if i < 0:
+        return
     tri = triangle[i]
     d = direction[i]
     look = Look()
@@ -163,7 +167,8 @@ def onward(
         `bounce_limit`: those whose mirror shows the domes as `bounces` ended there.
     """
     device, width = scene.device, gbuffer.camera.size[0]
-    index, weight = None, wp.zeros(0, dtype=wp.vec3, device=device)
+    index: wp.array | None = None  # of the first layer's rays; None: all
+    weight = wp.zeros(0, dtype=wp.vec3, device=device)
     first, total = layer, seen
     for depth in range(bounces + 1):
         asked = meeting(scene, layer, mirrors.patches)
@@ -174,10 +179,10 @@ def onward(
         normals = prepare_normals(scene, gbuffer, layer, threads)
         point, normal, direction, carried, domes = (wp.zeros(n, dtype=wp.vec3, device=device) for _ in range(5))
         inputs = [scene.view, scene.lights, looks, normals, layer.triangle, layer.u, layer.v]
-        inputs += [layer.pixels.direction, weight, wp.array(asked, dtype=int, device=device)]
+        inputs += [layer.pixels.direction, weight, asked]
         inputs += [point, normal, direction, carried, domes]
         launch.launch(reflect_hits_kernel, n, inputs, device, threads)
-        going = np.flatnonzero(carried.numpy().max(axis=1) > 0.0)
+        going = compact.positive(carried)
         if not len(going):
             break
         if depth == bounces:
@@ -186,16 +191,13 @@ def onward(
         add_statistics(first.statistics, {"bounced": len(going)})
         if total is seen:
             total = wp.clone(seen)
+        taken = lambda array: compact.taken(array, going)  # noqa: B023, E731
         if len(going) < n:
-            asked = asked[going]
-            point, normal, direction, carried, domes = (
-                wp.array(array.numpy()[going], dtype=wp.vec3, device=device)
-                for array in (point, normal, direction, carried, domes)
+            asked, point, normal, direction, carried, domes = map(
+                taken, (asked, point, normal, direction, carried, domes)
             )
-        index, weight = asked if index is None else index[asked], carried
-        facet, pixel = (
-            wp.array(array.numpy()[asked], dtype=int, device=device) for array in (layer.triangle, layer.pixels.pixel)
-        )
+        index, weight = asked if index is None else compact.taken(index, asked), carried
+        facet, pixel = (compact.taken(array, asked) for array in (layer.triangle, layer.pixels.pixel))
         pixels = MirrorPixels(layer.pixels.reflector, pixel, point, normal, direction, layer.pixels.box)
         layer = ReflectionLayer.empty(pixels, Technique.RAYTRACED, device)
         if forward is not None and depth == 0:
@@ -204,8 +206,7 @@ def onward(
             add_statistics(first.statistics, layer.statistics)
         else:
             bvh.trace_bounced(scene, layer, facet, mirrors.bodies, threads, kernels, width)
-        numbers = wp.array(index, dtype=int, device=device)
-        launch.launch(add_bounce_kernel, len(going), [numbers, weight, domes, met(layer), total], device, threads)
+        launch.launch(add_bounce_kernel, len(going), [index, weight, domes, met(layer), total], device, threads)
     return total
 
 
@@ -213,17 +214,13 @@ def _trace_others(
     scene: Scene, layer: ReflectionLayer, facet: wp.array, bodies: wp.array, threads: int, kernels: str, width: int
 ) -> None:
     """Trace the rays of a layer whose status is NONE."""
-    others = np.flatnonzero(layer.status.numpy() == int(Status.NONE))
+    others = compact.marked(layer.status, int(Status.NONE))
     if not len(others):
         return
     pixels = layer.pixels
-    some = [
-        wp.array(array.numpy()[others], dtype=array.dtype, device=scene.device)
-        for array in (pixels.pixel, pixels.point, pixels.normal, pixels.direction, facet)
-    ]
+    arrays = pixels.pixel, pixels.point, pixels.normal, pixels.direction, facet
+    some = [compact.taken(array, others) for array in arrays]
     rest = ReflectionLayer.empty(MirrorPixels(pixels.reflector, *some[:4], pixels.box), layer.method, scene.device)
     bvh.trace_bounced(scene, rest, some[4], bodies, threads, kernels, width)
     for name in ("triangle", "u", "v", "distance", "status"):
-        host = getattr(layer, name).numpy()
-        host[others] = getattr(rest, name).numpy()
-        getattr(layer, name).assign(host)
+        compact.put(getattr(layer, name), others, getattr(rest, name))

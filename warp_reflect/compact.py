@@ -66,6 +66,24 @@ def padded(marks: wp.array, value: int) -> tuple[wp.array, wp.array]:
 
 
 @wp.kernel
+def positive_kernel(first: int, values: wp.array(dtype=wp.vec3), out_mark: wp.array(dtype=wp.uint8)):
+    """One thread per element: 1 where any of its numbers is above 0."""
+    i = first + wp.tid()
+    out_mark[i] = wp.uint8(wp.where(wp.max(values[i]) > 0.0, 1, 0))
+
+
+def positive(values: wp.array) -> wp.array:
+    """Ascending numbers of the elements of a vec3 array, none of whose numbers is below 0, that are not 0, int32."""
+    if not stays(values.device):
+        x, y, z = values.numpy().T
+        numbers = np.flatnonzero(x + y + z > 0.0).astype(np.int32)
+        return wp.array(numbers, dtype=int, device=values.device)
+    marks = wp.empty(len(values), dtype=wp.uint8, device=values.device)
+    launch(positive_kernel, len(values), [values, marks], values.device)
+    return marked(marks, 1)
+
+
+@wp.kernel
 def count_kernel(first: int, marks: wp.array(dtype=wp.uint8), value: int, out_count: wp.array(dtype=int)):
     """One thread per element, on a device."""
     if int(marks[first + wp.tid()]) == value:
@@ -79,6 +97,22 @@ def counted(marks: wp.array, value: int) -> wp.array:
     count = wp.zeros(1, dtype=int, device=marks.device)
     launch(count_kernel, len(marks), [marks, value, count], marks.device)
     return count
+
+
+@wp.kernel
+def every_kernel(first: int, out_number: wp.array(dtype=int)):
+    """One thread per element."""
+    i = first + wp.tid()
+    out_number[i] = i
+
+
+def every(count: int, device) -> wp.array:
+    """The numbers from 0 on, int32."""
+    if not stays(device):
+        return wp.array(np.arange(count, dtype=np.int32), dtype=int, device=device)
+    numbers = wp.empty(count, dtype=int, device=device)
+    launch(every_kernel, count, [numbers], device)
+    return numbers
 
 
 def taken(array: wp.array, numbers: wp.array) -> wp.array:

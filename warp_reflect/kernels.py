@@ -44,7 +44,7 @@ ROWS = {
     "raytraced": ("bvh", "|wide_tree", "|bvh_vector"),
     "refinement": ("|techniques.refine_vector", "-techniques.refine"),
     "grid": ("techniques.interpolation",),
-    "second_bounce": ("bounces", "bvh/bounced"),
+    "second_bounce": ("bounces", "-bvh/bounced"),
     "clearcoat": ("finishes.coat",),
     "fade": ("finishes.fade",),
 }

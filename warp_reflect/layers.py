@@ -11,11 +11,14 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 import warp as wp
 
+from warp_reflect import compact
 from warp_reflect.counts import Statistics
+from warp_reflect.launch import launch, module_part, stays
 from warp_reflect.scene import CameraData, Scene
 from warp_reflect.settings import Status
 
 wp.set_module_options({"enable_backward": False})
+MET = module_part(__name__, "met")
 
 
 @wp.struct
@@ -308,8 +311,32 @@ class ReflectionLayer:
         )
 
 
-def meeting(scene: Scene, layer: ReflectionLayer, patches: np.ndarray) -> np.ndarray:
-    """Which rays of a layer meet one of the patches, bool [patches of the scene]: int32, ascending."""
+@wp.kernel(module=MET)
+def met_kernel(
+    first: int,
+    triangle: wp.array(dtype=int),
+    triangle_patch: wp.array(dtype=int),
+    patches: wp.array(dtype=wp.uint8),
+    out_met: wp.array(dtype=wp.uint8),
+):
+    """One thread per ray: whether it meets one of the patches."""
+    i = first + wp.tid()
+    out_met[i] = wp.uint8(0)
+    if triangle[i] >= 0:
+        out_met[i] = patches[triangle_patch[triangle[i]]]
+
+
+def meeting(scene: Scene, layer: ReflectionLayer, patches: np.ndarray) -> wp.array:
+    """Which rays of a layer meet one of the patches, bool [patches of the scene]: ascending, see `compact.padded`."""
+    if stays(scene.device):
+        key = "patches", None, patches.tobytes()
+        if key not in scene.facts:
+            scene.facts[key] = wp.array(patches.astype(np.uint8), dtype=wp.uint8, device=scene.device)
+        met = wp.empty(layer.pixels.count, dtype=wp.uint8, device=scene.device)
+        inputs = [layer.triangle, scene.view.triangle_patch, scene.facts[key], met]
+        launch(met_kernel, len(met), inputs, scene.device)
+        return compact.padded(met, 1)[0]
     triangle = layer.triangle.numpy()
     met = scene.host_triangle_patch.take(triangle, mode="clip")
-    return np.flatnonzero(patches.take(met) & (triangle >= 0)).astype(np.int32)
+    numbers = np.flatnonzero(patches.take(met) & (triangle >= 0)).astype(np.int32)
+    return wp.array(numbers, dtype=int, device=scene.device)

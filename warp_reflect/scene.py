@@ -8,6 +8,7 @@ Matrices act on columns: `p_world = world_from_object @ [p, 1]`.
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -419,6 +420,13 @@ class Scene:
     def shares_world(self, other: Scene) -> bool:
         """Whether two scenes are the same arrays, seen at two times."""
         return self.view is other.view
+
+    def kept(self, what: str, given, make: Callable):
+        """What `make()` gives, made again where `given` is not what it was made for; for this time of the stage alone."""
+        known = self.facts.get((what, None))
+        if known is None or known[0] != given:
+            known = self.facts[what, None] = given, make()
+        return known[1]
 
     @cached_property
     def has_hole(self) -> np.ndarray | None:

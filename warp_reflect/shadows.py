@@ -440,7 +440,8 @@ def shadowed_irradiance(
     device = scene.device
     count = len(points.triangle)
     result = wp.zeros(count, dtype=wp.vec3, device=device)
-    distant, areas = _flags(cast.distant, device), _flags(cast.areas, device)
+    of_lights = cast.distant, cast.areas
+    distant, areas = scene.kept("lights that cast", of_lights, lambda: [_flags(each, device) for each in of_lights])
     mesh, lights = wp.uint64(scene.shadow_tracer.id), scene.lights.direct
     if scene.has_hole is not None:
         from warp_reflect import cut_shadows  # only scenes with cut-outs need it

@@ -310,17 +310,17 @@ def mirror_pixels(
     width, height = gbuffer.camera.size
     if not parts:
         return {}, wp.zeros(width * height, dtype=int, device=scene.device)
-    found, reflector_id = _pixels_of(scene, gbuffer, parts, threads)
+    found, reflector_id = _pixels_of(scene, gbuffer, parts, threads, "reflectors")
     return {id: _met(scene, gbuffer, id, *found[id], threads, kernels) for id in parts}, reflector_id
 
 
 def _pixels_of(
-    scene: Scene, gbuffer: GBuffer, parts: Mapping[int, int], threads: int
+    scene: Scene, gbuffer: GBuffer, parts: Mapping[int, int], threads: int, who: str = "others"
 ) -> tuple[dict[int, tuple[wp.array, Box]], wp.array]:
     """(by id: the ascending pixels that show a part, and their bounds; id per pixel, 0 where there is none of the parts)."""
     width, height = gbuffer.camera.size
     ids = wp.empty(width * height, dtype=int, device=scene.device)
-    patches = [gbuffer.triangle, scene.view.triangle_patch, _id_of_patch(scene, parts)]
+    patches = [gbuffer.triangle, scene.view.triangle_patch, _id_of_patch(scene, parts, who)]
     launch.launch(reflector_id_kernel, width * height, [*patches, ids], scene.device, threads)
     if launch.stays(scene.device):
         return _sorted_by_id(ids, parts, width), ids
@@ -329,15 +329,16 @@ def _pixels_of(
     return {id: (numbers[id], pixel_bounds(pixel, width)) for id, pixel in found.items()}, ids
 
 
-def _id_of_patch(scene: Scene, parts: Mapping[int, int]) -> wp.array:
-    """int32 [patches], 0 of those of no such part; the last that were asked for are kept with the scene."""
-    known = scene.facts.get(("ids of patches", None))
-    if known is None or known[0] != parts:
+def _id_of_patch(scene: Scene, parts: Mapping[int, int], who: str) -> wp.array:
+    """int32 [patches], 0 of those of no such part; the last that were asked for by `who` are kept with the scene."""
+
+    def make() -> wp.array:
         ids = np.zeros(max(len(scene.patch_shapes), 1), np.int32)
         for id, part in parts.items():
             ids[scene.parts[part].patches] = id
-        known = scene.facts["ids of patches", None] = dict(parts), wp.array(ids, dtype=int, device=scene.device)
-    return known[1]
+        return wp.array(ids, dtype=int, device=scene.device)
+
+    return scene.kept(f"ids of {who}", dict(parts), make)
 
 
 def _met(

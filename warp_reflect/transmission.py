@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from warp_reflect import bvh, launch, shade, vector
+from warp_reflect import bvh, compact, launch, shade, vector
 from warp_reflect.counts import add_statistics
 from warp_reflect.layers import (
     NO_REFLECTOR,
@@ -137,6 +137,10 @@ def make_interfaces(scene: Scene, finishes: Mapping[int, FinishData]) -> Interfa
         scene: The scene.
         finishes: Transparent part to what is asked of it; one that is not to be frosted has frost 0.
     """
+    return scene.kept("interfaces", finishes, lambda: _interfaces(scene, finishes))
+
+
+def _interfaces(scene: Scene, finishes: Mapping[int, FinishData]) -> Interfaces:
     # By columns, see `bounces.Mirrors`.
     views = np.zeros(len(scene.patch_shapes), InterfaceView.numpy_dtype())
     clear = np.zeros(len(scene.patch_shapes), bool)
@@ -563,8 +567,8 @@ def through_radiance(scene: Scene, through: Through, found: Transmission, settin
     seen = through.met(found.layer)
     patches = None
     if interfaces.fades:
-        triangle = gbuffer.triangle.numpy()[found.layer.pixels.pixel.numpy()]
-        patches = wp.array(scene.host_triangle_patch[triangle], dtype=int, device=scene.device)
+        facets = compact.taken(gbuffer.triangle, found.layer.pixels.pixel)
+        patches = compact.taken(scene.view.triangle_patch, facets)
     asked = [interfaces, found.layer, seen, settings, through.met, patches, found.nearness]
     return behind(scene, gbuffer, *asked)
 
@@ -608,7 +612,7 @@ def behind(
         inputs = [interfaces.views, given, layer.triangle, layer.distance, seen]
         launch.launch(met_kernel, count, [*inputs, total, near], device, threads)
         return total
-    index = np.arange(count, dtype=np.int32)
+    numbers = compact.every(count, device)  # of the first layer's rays
     weight = wp.full(count, wp.vec3(1.0, 1.0, 1.0), dtype=wp.vec3, device=device)
     fading = wp.full(count if interfaces.fades else 0, -1, dtype=int, device=device)
     if interfaces.fades and patches is not None:
@@ -627,8 +631,7 @@ def behind(
         inputs += [layer.pixels.pixel, layer.pixels.direction, fading, weight, depth]
         outputs = [own, faded, point, normal, direction, inside, carried, still_fading]
         launch.launch(cross_hits_kernel, n, inputs + outputs, device, threads)
-        going = np.flatnonzero(carried.numpy().max(axis=1) > 0.0)
-        numbers = wp.array(index, dtype=int, device=device)
+        going = compact.positive(carried)
         if near is not None:
             before, way = way, wp.empty(n, dtype=float, device=device)
             ways = [numbers, layer.triangle, layer.distance, own, carried, before, way, near]
@@ -645,8 +648,8 @@ def behind(
         if not len(going):
             break
         add_statistics(first.statistics, {"onward": len(going)})
-        taken = lambda array: wp.array(array.numpy()[going], dtype=array.dtype, device=device)  # noqa: B023, E731
-        index, weight = index[going], taken(carried)
+        taken = lambda array: compact.taken(array, going)  # noqa: B023, E731
+        numbers, weight = taken(numbers), taken(carried)
         fading = taken(still_fading) if len(fading) else fading
         way = taken(way) if len(way) else way
         pixels = MirrorPixels(

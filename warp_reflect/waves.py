@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import partial
 
 import numpy as np
 import warp as wp
@@ -158,6 +159,10 @@ def wave_normals_kernel(
     out_normals[i] = turned
 
 
+def _waves(scene: Scene, part: int, finish: FinishData) -> wp.array:
+    return wp.array(waves_of(scene, scene.parts[part], finish), dtype=Wave, device=scene.device)
+
+
 def wave_normals(
     scene: Scene,
     gbuffer: GBuffer,
@@ -188,7 +193,8 @@ def wave_normals(
     bent = wp.clone(normals) if len(normals) else wp.zeros(len(gbuffer.triangle), dtype=wp.vec3, device=device)
     for part, finish in asked.items():
         seen = pixels[part]
-        waves = wp.array(waves_of(scene, scene.parts[part], finish), dtype=Wave, device=device)
+        asked_at = finish, scene.data.time
+        waves = scene.kept(f"waves of {part}", asked_at, partial(_waves, scene, part, finish))
         inputs = [gbuffer.view, waves, gbuffer.triangle, seen.pixel, seen.point, seen.normal, bent]
         if vector.chosen(kernels, device):
             from warp_reflect import waves_vector  # which works with this module's structure

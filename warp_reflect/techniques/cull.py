@@ -47,12 +47,12 @@ def settle_culled(
     first, count, corners = (values[scene.boxes[1] >= WORTH] for values in scene.boxes)
     if not 0 < 8 * len(first) <= CORNER_SHARE * scene.vertex_count:
         return lambda: 0
-    key = "boxes", None
-    if key not in scene.facts:
+
+    def make() -> tuple[wp.array, wp.array, wp.array]:
         numbers = (wp.array(each.astype(np.int32), dtype=int, device=scene.device) for each in (first, count))
-        places = wp.array(corners.reshape(-1, 3).astype(np.float32), dtype=wp.vec3, device=scene.device)
-        scene.facts[key] = *numbers, places
-    boxes, focal = scene.facts[key], max(camera.fx, camera.fy)
+        return *numbers, wp.array(corners.reshape(-1, 3).astype(np.float32), dtype=wp.vec3, device=scene.device)
+
+    boxes, focal = scene.kept("boxes", None, make), max(camera.fx, camera.fy)
     gone = virtual_mesh.settle_gone(boxes, solve(boxes[2]), unit_per_scene, focal, pixels.box, out_vertex)
     return lambda: int(count[gone.numpy() == 1].sum())
 
