@@ -47,6 +47,41 @@ def test_exr_has_the_named_channels_with_half_colour_and_float_data(tmp_path):
     assert (spec.width, spec.height) == (SHAPE[1], SHAPE[0])
 
 
+TOLD = """
+import sys
+import numpy as np
+from pathlib import Path
+from warp_reflect import images
+
+def write(k):
+    images.write_exr("a.exr", {"Z": np.zeros((2, 2))}, attributes={"warp_reflect:plan": {"step": f"{k} " * 50_000}})
+    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
+
+sizes = [write(1000 + k) for k in range(120)]
+_, attributes = images.read_exr("a.exr")
+print(max(sizes[20:]) - max(sizes[:20]), attributes["warp_reflect:plan"] == {"step": "1119 " * 50_000})
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="resident memory is read from Linux' /proc")
+def test_texts_of_written_files_are_not_kept(tmp_path):
+    # OpenImageIO keeps all it is shown: here 250 kB a file, 25 MB in all.
+    told = subprocess.run([sys.executable, "-c", TOLD], cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+    grown, same = told.split()
+    assert same == "True"
+    assert int(grown) < 4e6
+
+
+def test_header_entries_of_any_name_and_length_are_written(tmp_path):
+    told = {"warp_reflect:empty": "", "warp_reflect:one": "a", "Copyright": "nobody", "warp_reflect:long": "ä" * 300}
+    for multi_part in (False, True):
+        images.write_exr(tmp_path / "a.exr", channels(), attributes=told, multi_part=multi_part)
+        _, attributes = images.read_exr(tmp_path / "a.exr")
+        assert attributes["Copyright"] == "nobody"
+        assert attributes["warp_reflect:one"] == "a"
+        assert attributes["warp_reflect:long"] == "ä" * 300
+
+
 def test_exr_round_trip_keeps_data_exactly_and_attributes(tmp_path):
     eye = np.array([1.0 / 3.0, 2.0e7 + 1.0 / 3.0, -1e-9])
     written = channels()

@@ -14,7 +14,7 @@ import stat
 from collections.abc import Collection, Iterator, Mapping
 from itertools import count
 from pathlib import Path
-from typing import NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
@@ -28,6 +28,12 @@ SIDE_LIMIT = 32768  # pixels
 # Rows that are put together and handed over at once, for each thread of the writer: one ZIP block of an EXR. More would be
 # turned into pixels in main memory instead of in a core's own.
 ROWS_AT_ONCE = 16
+# OpenImageIO keeps every text that it is ever shown until the process ends: the plans of 500 frames are 5 MB. So it is shown
+# stand-ins, which differ by their length alone, in steps of so many bytes where JSON may be filled up with blanks.
+TEXT_STEP = 256
+STAND_IN = "-"
+OWN_ENTRIES = "warp_reflect:"  # the library gives names that it knows (Copyright) others in the file
+HEADER_START = 8  # bytes: an EXR's magic number and version
 
 # x and y of red, green, blue and white: ITU-R BT.709.
 REC709_PRIMARIES = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
@@ -191,10 +197,16 @@ def write_exr(
         if title:
             spec.attribute("oiio:subimagename", title)
         parts.append((spec, planes))
+    texts: dict[str, bytes] = {}
     for name, value in (attributes or {}).items():
-        plain = isinstance(value, str | int | float) and not isinstance(value, bool)
-        parts[0][0].attribute(name, value if plain else json.dumps(_jsonable(value)))
-    _write_whole(Path(path), "openexr", parts)
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            parts[0][0].attribute(name, value)
+            continue
+        text = value.encode() if isinstance(value, str) else _filled_up(json.dumps(_jsonable(value)).encode())
+        if text and name.startswith(OWN_ENTRIES):
+            texts[name] = text
+        parts[0][0].attribute(name, STAND_IN * len(text) if name in texts else text.decode())
+    _write_whole(Path(path), "openexr", parts, texts)
     return replaced
 
 
@@ -376,6 +388,40 @@ def _jsonable(value):
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
 
 
+def _filled_up(text: bytes) -> bytes:
+    """JSON with blanks at its end."""
+    return text.ljust(-(-len(text) // TEXT_STEP) * TEXT_STEP)
+
+
+def _put_texts(file: BinaryIO, texts: Mapping[str, bytes]) -> None:
+    """Put texts in the place of their stand-ins of the same length in the first header of an EXR.
+
+    An entry of a header is its name and its type, a zero byte after either, the length of its value in 4 bytes, and the
+    value; an empty name ends the header (OpenEXR File Layout).
+    """
+    file.seek(HEADER_START)
+    left = dict(texts)
+    while name := _until_zero(file):
+        kind = _until_zero(file)
+        length = int.from_bytes(file.read(4), "little")
+        end = file.tell() + length
+        text = left.pop(name.decode(), None)
+        if text is not None:
+            if kind != b"string" or length != len(text):
+                raise OSError(f"header entry '{name.decode()}' came out as {length} bytes of {kind.decode()}")
+            file.write(text)
+        file.seek(end)
+    if left:
+        raise OSError(f"header entries {', '.join(left)} were left out")
+
+
+def _until_zero(file: BinaryIO) -> bytes:
+    text = b""
+    while (letter := file.read(1)) not in (b"\0", b""):
+        text += letter
+    return text
+
+
 def _parsed(value):
     if isinstance(value, str) and value[:1] in ("[", "{"):
         try:
@@ -401,8 +447,10 @@ def _part_mark(path: Path) -> str:
     return hashlib.blake2b(path.name.encode(), digest_size=6).hexdigest()
 
 
-def _write_whole(path: Path, format_name: str, parts: list[tuple]) -> None:
+def _write_whole(path: Path, format_name: str, parts: list[tuple], texts: Mapping[str, bytes] | None = None) -> None:
     """Write (spec, planes) parts under a passing name, read back, sync and rename: a reader never meets half a file.
+
+    `texts` are put in the place of their stand-ins after the reading back, which keeps them too.
 
     The PNG writer returns success on a full disk and only `geterror` tells; a cut EXR keeps a valid header.
     """
@@ -428,7 +476,10 @@ def _write_whole(path: Path, format_name: str, parts: list[tuple]) -> None:
         if not good or message:
             raise OSError(f"{path}: cannot be written: {_one_line(message, part) or 'the writer failed'}")
         _check_last_rows(path, part, specs)
-        with open(part, "rb") as file:
+        with open(part, "r+b") as file:
+            if texts:
+                _put_texts(file, texts)
+            file.flush()
             os.fsync(file.fileno())
         os.replace(part, final)
         _sync_folder(final.parent)
