@@ -72,7 +72,7 @@ def of_view(settings: Settings, device: wp.DeviceLike, casting: bool = False, mi
     """
     asked = ["|vector", "raster", "|raster_vector", "-raster/plain"]
     if mirrors:
-        asked += ["surface"]
+        asked += ["-surface", "|surface_vector"]
     if casting:
         asked += ["direct", "|shadow_starts_vector", "-shadow_starts/plain"]
         asked += ["|wide_tree", "|shadows_vector", "-shadows/tried"]
@@ -95,7 +95,7 @@ def of_plan(plan: Plan) -> list[str]:
         sent = ["-direct", "|shadow_starts_vector", "-shadow_starts/plain", "|shadows_vector", "-shadows/plain"]
         asked += ["direct", "cut_shadows"] if cut else sent
     if seen:
-        asked += ["surface", "|surface_vector", "-surface/plain", "shade"]
+        asked += ["-surface", "|surface_vector", "-surface/plain", "shade"]
     for row in seen:
         on = [row.technique, *(name for name, effect in row.effects.items() if effect.on)]
         asked += [module for name in on for module in ROWS.get(name, ())]

@@ -669,5 +669,11 @@ def draw_triangles(
         rasterise(target, screen, triangles, **named, threads=threads, kernels=kernels)
     triangle = wp.empty(width * height, dtype=int, device=device)
     depth_key = wp.empty(width * height, dtype=float, device=device)
-    launch(resolve_kernel, width * height, [target.key, triangle, depth_key], device, threads)
+    inputs = [target.key, triangle, depth_key]
+    if vector.chosen(kernels, device):
+        from warp_reflect import raster_vector  # as above
+
+        vector.launch_blocks(raster_vector.resolve_blocks_kernel, width * height, inputs, device, threads)
+    else:
+        launch(resolve_kernel, width * height, inputs, device, threads)
     return GBuffer(camera, view, triangle, depth_key)

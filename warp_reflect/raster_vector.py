@@ -658,3 +658,34 @@ def draw_blocks_kernel(
                 )
         left = left >> wp.uint64(1)
         i += 1
+
+
+@wp.func_native(
+    vector.snippet(r"""
+    const unsigned long long* keys = (const unsigned long long*)key.data;
+    const int end = begin + BLOCK < key.shape[0] ? begin + BLOCK : key.shape[0];
+    int i = begin;
+    // The complement of an empty key's half is -1.
+    for (; i + LANES <= end; i += LANES) {
+        I low, high;
+        halves(keys + i, low, high);
+        istore(out_triangle.data + i, ~low);
+        store(out_depth_key.data + i, __builtin_bit_cast(F, high));
+    }
+    for (; i < end; ++i) {
+        out_triangle.data[i] = ~(int)keys[i];
+        out_depth_key.data[i] = __builtin_bit_cast(float, (unsigned)(keys[i] >> 32));
+    }
+""")
+)
+def resolve_block(
+    begin: int, key: wp.array(dtype=wp.uint64), out_triangle: wp.array(dtype=int), out_depth_key: wp.array(dtype=float)
+): ...
+
+
+@wp.kernel
+def resolve_blocks_kernel(
+    first: int, key: wp.array(dtype=wp.uint64), out_triangle: wp.array(dtype=int), out_depth_key: wp.array(dtype=float)
+):
+    """As `raster.resolve_kernel`, one thread per block of pixels."""
+    resolve_block((first + wp.tid()) * BLOCK, key, out_triangle, out_depth_key)

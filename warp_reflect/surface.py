@@ -310,18 +310,23 @@ def mirror_pixels(
     width, height = gbuffer.camera.size
     if not parts:
         return {}, wp.zeros(width * height, dtype=int, device=scene.device)
-    found, reflector_id = _pixels_of(scene, gbuffer, parts, threads, "reflectors")
+    found, reflector_id = _pixels_of(scene, gbuffer, parts, threads, kernels, "reflectors")
     return {id: _met(scene, gbuffer, id, *found[id], threads, kernels) for id in parts}, reflector_id
 
 
 def _pixels_of(
-    scene: Scene, gbuffer: GBuffer, parts: Mapping[int, int], threads: int, who: str = "others"
+    scene: Scene, gbuffer: GBuffer, parts: Mapping[int, int], threads: int, kernels: str, who: str = "others"
 ) -> tuple[dict[int, tuple[wp.array, Box]], wp.array]:
     """(by id: the ascending pixels that show a part, and their bounds; id per pixel, 0 where there is none of the parts)."""
     width, height = gbuffer.camera.size
     ids = wp.empty(width * height, dtype=int, device=scene.device)
-    patches = [gbuffer.triangle, scene.view.triangle_patch, _id_of_patch(scene, parts, who)]
-    launch.launch(reflector_id_kernel, width * height, [*patches, ids], scene.device, threads)
+    inputs = [gbuffer.triangle, scene.view.triangle_patch, _id_of_patch(scene, parts, who), ids]
+    if vector.chosen(kernels, scene.device):
+        from warp_reflect import surface_vector  # which reflects at this module's surface
+
+        vector.launch_blocks(surface_vector.id_blocks_kernel, width * height, inputs, scene.device, threads)
+    else:
+        launch.launch(reflector_id_kernel, width * height, inputs, scene.device, threads)
     if launch.stays(scene.device):
         return _sorted_by_id(ids, parts, width), ids
     found = _pixels_by_id(ids.numpy(), parts)
@@ -393,7 +398,7 @@ def part_pixels(
     found = {part: known[part] for part in parts if part in known}
     others = [part for part in parts if part not in known]
     if others:
-        pixels, _ = _pixels_of(scene, gbuffer, dict(enumerate(others, 1)), threads)
+        pixels, _ = _pixels_of(scene, gbuffer, dict(enumerate(others, 1)), threads, kernels)
         for id, part in enumerate(others, 1):
             found[part] = _met(scene, gbuffer, NO_REFLECTOR, *pixels[id], threads, kernels)
     return {part: pixels for part, pixels in found.items() if pixels.count}
@@ -402,7 +407,7 @@ def part_pixels(
 def seen_parts(scene: Scene, gbuffer: GBuffer, parts: Iterable[int]) -> dict[int, int]:
     """Number of the pixels at which the eye sees each of some parts."""
     asked = dict(enumerate(parts, 1))
-    found, _ = _pixels_of(scene, gbuffer, asked, 0)
+    found, _ = _pixels_of(scene, gbuffer, asked, 0, "auto")
     return {part: len(found[id][0]) for id, part in asked.items()}
 
 

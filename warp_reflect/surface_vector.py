@@ -34,8 +34,8 @@ BLOCK = wp.constant(vector.BLOCK)
     for (int start = begin; start < end; start += LANES) {
         const I element = start + lanes();
         const I valid = element < end;
-        const I own = ipick(valid, element, I(end - 1));
-        const I at = igather(pixel.data, own);
+        const I at = start + LANES <= end ? iload(pixel.data + start)
+                                          : igather(pixel.data, ipick(valid, element, I(end - 1)));
         const int first_row = at[0] / camera.width;
         const bool one_row = at[LANES - 1] < (first_row + 1) * camera.width;
         const I row = one_row ? I(first_row) : at / camera.width;
@@ -210,3 +210,41 @@ def mirror_blocks_kernel(
             mirror_pixel(scene, camera, triangle, depth_key, pixel[i], i, out_point, out_normal, out_direction)
         left = left >> wp.uint64(1)
         i += 1
+
+
+@wp.func_native(
+    vector.snippet(r"""
+    const int end = begin + BLOCK < triangle.shape[0] ? begin + BLOCK : triangle.shape[0];
+    const int* seen = triangle.data;
+    auto id_of = [&](int t) -> int { return t < 0 ? 0 : patch_id.data[triangle_patch.data[t]]; };
+    int i = begin;
+    for (; i + LANES <= end; i += LANES) {
+        const I t = iload(seen + i);
+        I id;
+        // Side by side lie pixels of one triangle, and where there is nothing.
+        if (!bits(t != seen[i])) id = I(id_of(seen[i]));
+        else EACH_LANE id[l] = id_of(t[l]);
+        istore(out_id.data + i, id);
+    }
+    for (; i < end; ++i) out_id.data[i] = id_of(seen[i]);
+""")
+)
+def id_block(
+    begin: int,
+    triangle: wp.array(dtype=int),
+    triangle_patch: wp.array(dtype=int),
+    patch_id: wp.array(dtype=int),
+    out_id: wp.array(dtype=int),
+): ...
+
+
+@wp.kernel
+def id_blocks_kernel(
+    first: int,
+    triangle: wp.array(dtype=int),
+    triangle_patch: wp.array(dtype=int),
+    patch_id: wp.array(dtype=int),
+    out_id: wp.array(dtype=int),
+):
+    """As `surface.reflector_id_kernel`, one thread per block of pixels."""
+    id_block((first + wp.tid()) * BLOCK, triangle, triangle_patch, patch_id, out_id)
