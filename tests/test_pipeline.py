@@ -13,6 +13,7 @@ import sys
 import threading
 import weakref
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -444,6 +445,24 @@ def test_claims_exclude_each_other_and_leave_nothing(tmp_path):
     assert most[0] == 1
     assert won == [50] * 4
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("count", "workers"), [(200, 2), (7, 2), (1, 3), (1000, 8)])
+def test_every_worker_gets_the_same_share_and_ends_with_short_batches(count, workers):
+    plain = SimpleNamespace(reuses=False)
+    parts = cluster._parts(plain, list(range(count)), workers)
+    assert [place for part in parts for batch in part for place in batch] == list(range(count))
+    shares = [sum(map(len, part)) for part in parts]
+    assert max(shares) - min(shares) <= 1
+    assert all(len(part[-1]) == 1 for part in parts if part)
+    assert max(len(batch) for part in parts for batch in part) <= cluster.BATCH_MAX
+
+
+def test_what_reuses_from_frame_to_frame_is_cut_where_it_starts_afresh():
+    parts = cluster._parts(SimpleNamespace(reuses=True), list(range(5, 200)), 2)
+    batches = [batch for part in parts for batch in part]
+    assert [place for batch in batches for place in batch] == list(range(5, 200))
+    assert all(batch[0] % pipeline.REUSE_RUN == 0 for batch in batches[1:])
 
 
 def test_two_workers_write_the_same_bytes_although_one_is_killed(render, monkeypatch):

@@ -11,6 +11,7 @@ import contextlib
 import dataclasses
 import itertools
 import logging
+import math
 import queue
 import signal
 import threading
@@ -18,12 +19,13 @@ import uuid
 from collections.abc import Callable, Iterator
 
 from warp_reflect.launch import CORES_VARIABLE, thread_count
-from warp_reflect.pipeline import FRAME_FAILURES, REUSE_RUN, Job, OpenJob, Outcome, one_line, render_places
+from warp_reflect.pipeline import FRAME_FAILURES, REUSE_RUN, Job, OpenJob, Outcome, one_line, part_of, render_places
 from warp_reflect.progress import Report
 
 SCHEDULER_SECONDS = 10.0  # how long a scheduler may take to answer
-BATCHES_PER_WORKER = 4  # so that the last worker is not waited for long
 BATCH_MAX = 16  # frames; from here on a longer batch saves nothing
+# A batch is so large a share of what its worker has left, so that at the end no worker is waited for long.
+BATCH_SHARE = 0.34
 POLL_SECONDS = 0.1
 # Of the workers' allocator (glibc), before they start. dask has it hand memory back whenever 64 KB are free, and threads beside
 # the first map anew whatever is large: a frame's arrays would be cleared by the system every time, for a quarter of its time.
@@ -82,14 +84,13 @@ def render_on_cluster(
             )
             waiting[future] = batch
 
-        size = min(BATCH_MAX, -(-len(places) // (BATCHES_PER_WORKER * workers)))
         waiting: dict = {}
         told: set[int] = set()
-        batches = _batches(job, places, size)
-        for k, batch in enumerate(batches):
+        for k, part in enumerate(_parts(job, places, workers)):
             # Each worker is to have one part of the range: what a batch's first frame takes from the one before is at
             # hand. One that has nothing left may take from another, so may any where one is lost.
-            submit(batch, addresses[k * workers // len(batches)] if addresses else None)
+            for batch in part:
+                submit(batch, addresses[k] if addresses else None)
         while waiting:
             with contextlib.suppress(queue.Empty):
                 outcome = _from_plain(events.get(timeout=POLL_SECONDS))
@@ -124,11 +125,23 @@ def render_on_cluster(
                         yield outcome
 
 
-def _batches(job: Job, places: list[int], size: int) -> list[list[int]]:
-    """Consecutive frames in lots of a size; what reuses from frame to frame is cut only where that starts afresh."""
-    if not job.reuses:
-        return [places[k : k + size] for k in range(0, len(places), size)]
-    return [list(run) for _, run in itertools.groupby(places, key=lambda place: place // REUSE_RUN)]
+def _parts(job: Job, places: list[int], workers: int) -> list[list[list[int]]]:
+    """Every worker's part of a range, in batches of consecutive frames that become shorter towards its end.
+
+    What reuses from frame to frame is cut only where that starts afresh.
+    """
+    if job.reuses:
+        runs = [list(run) for _, run in itertools.groupby(places, key=lambda place: place // REUSE_RUN)]
+        return [[runs[k] for k in part_of(len(runs), (w, workers))] for w in range(1, workers + 1)]
+    parts = []
+    for w in range(1, workers + 1):
+        left, part = [places[k] for k in part_of(len(places), (w, workers))], []
+        while left:
+            size = min(BATCH_MAX, math.ceil(BATCH_SHARE * len(left)))
+            part.append(left[:size])
+            left = left[size:]
+        parts.append(part)
+    return parts
 
 
 @contextlib.contextmanager
