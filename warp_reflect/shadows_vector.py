@@ -152,43 +152,87 @@ CODES += [SAME_TURN, FLATNESS, LEAST_COUNT, SHARP, LEAST_SPREAD, STEEP]
         together |= together >> 8;
         return (int)(together & (dark | lit));
     };
-    auto shared_share = [&](const unsigned char* shared, const float* unshadowed, int j) -> float {
-        const float* own = rows + begin + j;
-        const float p_x = own[0], p_y = own[stride], p_z = own[2 * stride];
-        const float side_x = own[6 * stride], side_y = own[7 * stride], side_z = own[8 * stride];
-        int known = 0, total = 0, squares = 0, sum_x = 0, sum_y = 0, square_x = 0, along_x = 0, along_y = 0;
-        float brought = 0.0f, arrived = 0.0f;
-        for (int y = -neighbours; y <= neighbours; ++y) {
-            for (int x = -neighbours; x <= neighbours; ++x) {
-                const int entry = shared[place[j] + y * line + x];
-                if (entry == 0) continue;
-                int i = number[j] + y * around.width + x;
-                if (around.index.shape[0] > 0) i = around.index.data[i];
-                const float* other = rows + i;
-                const float away_x = other[0] - p_x, away_y = other[stride] - p_y, away_z = other[2 * stride] - p_z;
-                const float beside = side_x * away_x + side_y * away_y + side_z * away_z;
-                const float apart = away_x * away_x + away_y * away_y + away_z * away_z;
-                const float turned = side_x * other[6 * stride] + side_y * other[7 * stride] + side_z * other[8 * stride];
-                if (!(beside * beside <= flatness * flatness * apart) || !(turned >= same_turn)) continue;
-                const int level = entry >> 2;
-                ++known;
-                total += level;
-                squares += level * level;
-                sum_x += x;
-                sum_y += y;
-                square_x += x * x;
-                along_x += x * level;
-                along_y += y * level;
-                brought += unshadowed[i];
-                arrived += unshadowed[i] * (float)level;
+    // Of points `own` of the block, as many as there are.
+    auto shared_shares = [&](const unsigned char* shared, const float* unshadowed, const int* own, int asks, float* out) {
+        for (int from = 0; from < asks; from += LANES) {
+            int here[LANES], pixel[LANES], entry_at[LANES], other[LANES];
+            bool in_fours = true;
+            for (int l = 0; l < LANES; ++l) {
+                const int j = own[from + l < asks ? from + l : asks - 1];
+                here[l] = begin + j;
+                pixel[l] = number[j];
+                entry_at[l] = place[j];
+                in_fours &= (l & 3) == 0 || (pixel[l] - pixel[l - 1] == 1);
             }
+            // Four pixels beside each other are mostly four points after one another.
+            auto pull = [&](const float* of, const int* index, bool fours) -> F {
+                F v;
+                if (fours) {
+                    Four part[LANES / 4];
+                    for (int h = 0; h < LANES / 4; ++h) __builtin_memcpy(&part[h], of + index[4 * h], sizeof(Four));
+#if defined(__AVX512F__)
+                    const auto low = __builtin_shufflevector(part[0], part[1], 0, 1, 2, 3, 4, 5, 6, 7);
+                    const auto high = __builtin_shufflevector(part[2], part[3], 0, 1, 2, 3, 4, 5, 6, 7);
+                    v = __builtin_shufflevector(low, high, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+#else
+                    v = __builtin_shufflevector(part[0], part[1], 0, 1, 2, 3, 4, 5, 6, 7);
+#endif
+                } else {
+                    EACH_LANE v[l] = of[index[l]];
+                }
+                return v;
+            };
+            const V p = V{pull(rows, here, false), pull(rows + stride, here, false), pull(rows + 2 * stride, here, false)};
+            const V side = V{pull(rows + 6 * stride, here, false), pull(rows + 7 * stride, here, false),
+                pull(rows + 8 * stride, here, false)};
+            I known = I(0), total = I(0), squares = I(0);
+            I sum_x = I(0), sum_y = I(0), square_x = I(0), along_x = I(0), along_y = I(0);
+            F brought = F(0.0f), arrived = F(0.0f);
+            for (int y = -neighbours; y <= neighbours; ++y) {
+                for (int x = -neighbours; x <= neighbours; ++x) {
+                    const int step = y * around.width + x, entry_step = y * line + x;
+                    I entry;
+                    EACH_LANE entry[l] = shared[entry_at[l] + entry_step];
+                    const I there = entry != 0;
+                    if (!bits(there)) continue;
+                    bool fours = in_fours;
+                    for (int l = 0; l < LANES; ++l) {
+                        int i = pixel[l] + step;
+                        if (around.index.shape[0] > 0 && there[l]) i = around.index.data[i];
+                        other[l] = there[l] ? i : -1;
+                    }
+                    for (int l = 0; l < LANES; ++l) fours &= other[l] >= 0 && other[l] - other[l & ~3] == (l & 3);
+                    if (!fours) for (int l = 0; l < LANES; ++l) other[l] = other[l] < 0 ? here[l] : other[l];
+                    auto row = [&](int r) -> F { return pull(rows + r * stride, other, fours); };
+                    const V away = sub(V{row(0), row(1), row(2)}, p);
+                    const F beside = dot(side, away);
+                    const F turned = dot(side, V{row(6), row(7), row(8)});
+                    const I near = there & (beside * beside <= flatness * flatness * dot(away, away)) & (turned >= same_turn);
+                    if (!bits(near)) continue;
+                    const I level = near & entry >> 2;
+                    known -= near;
+                    total += level;
+                    squares += level * level;
+                    sum_x += near & x;
+                    sum_y += near & y;
+                    square_x += near & x * x;
+                    along_x += x * level;
+                    along_y += y * level;
+                    const F brings = pull(unshadowed, other, fours);
+                    brought = pick(near, brought + brings, brought);
+                    arrived = pick(near, arrived + brings * __builtin_convertvector(level, F), arrived);
+                }
+            }
+            const I spread = total * (levels * known - total), between = known * squares - total * total;
+            const I edge = (sharp * between > spread) & (least_spread * spread > levels * levels * known * known);
+            const F slope_x = __builtin_convertvector(known * along_x - total * sum_x, F);
+            const F slope_y = __builtin_convertvector(known * along_y - total * sum_y, F);
+            const F limit = steep * __builtin_convertvector(levels * known * square_x, F);
+            const I asks_itself = edge | (slope_x * slope_x + slope_y * slope_y > limit * limit) | (known < least_count);
+            float mean[LANES];
+            store(mean, pick(asks_itself, F(-1.0f), arrived / ((float)levels * brought)));
+            for (int l = 0; l < LANES && from + l < asks; ++l) out[from + l] = mean[l];
         }
-        const int spread = total * (levels * known - total), between = known * squares - total * total;
-        const bool edge = sharp * between > spread && least_spread * spread > levels * levels * known * known;
-        const float slope_x = (float)(known * along_x - total * sum_x), slope_y = (float)(known * along_y - total * sum_y);
-        const float limit = steep * (float)(levels * known * square_x);
-        const bool narrow = slope_x * slope_x + slope_y * slope_y > limit * limit;
-        return edge || narrow || known < least_count ? -1.0f : arrived / ((float)levels * brought);
     };
     const int first_light = to_sky ? SKY : only_first || sharing ? distant_count : 0;
     const int last_light = to_sky ? SKY : distant_count + area_count - 1;
@@ -226,16 +270,22 @@ CODES += [SAME_TURN, FLATNESS, LEAST_COUNT, SHARP, LEAST_SPREAD, STEEP]
                     asks = together == (lit | dark);
                     if (together == dark) share[j] = 0.0f;
                     known[j] = (float)(entry >> 2) / (float)levels;
-                    if (asks && known_count > 0) {
-                        const float mean = shared_share(shared, starts.unshadowed.data + k * stride, j);
-                        asks = mean < 0.0f;
-                        if (!asks) share[j] = mean;
-                    }
                 }
             }
             if (!asks) continue;
             brought[j] = arrived[j] = 0.0f;
             asking[asking_count++] = j;
+        }
+        if (to_all && !distant && known_count > 0 && asking_count > 0) {
+            float mean[BLOCK];
+            shared_shares(shared, starts.unshadowed.data + k * stride, asking, asking_count, mean);
+            int left = 0;
+            for (int a = 0; a < asking_count; ++a) {
+                const int j = asking[a];
+                if (mean[a] < 0.0f) asking[left++] = j;
+                else share[j] = mean[a];
+            }
+            asking_count = left;
         }
         // Rays of a point lie side by side: they start at the same place.
         int point = 0, sample = known_count;
