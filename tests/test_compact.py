@@ -73,3 +73,12 @@ def test_what_is_not_black_is_listed_and_everything_counted(device):
         np.testing.assert_array_equal(found.numpy(), np.flatnonzero(values.any(axis=1)))
         np.testing.assert_array_equal(numbers.numpy(), np.arange(500))
         assert count.numpy().tolist() == [(values[:, 2] > 0.5).sum()]
+
+
+@pytest.mark.parametrize("count", [1, 32, 33, 5000])
+def test_largest_numbers_are_found(count, device):
+    values = np.random.default_rng(count).normal(size=(count, 3)).astype(np.float32)
+    given = wp.array(values, dtype=wp.vec3, device=device)
+    for way in (launch.as_device, launch.recorded):
+        with way():
+            np.testing.assert_array_equal(compact.largest(given).numpy(), values.max(axis=0, keepdims=True))

@@ -13,6 +13,8 @@ from warp_reflect.launch import launch, stays
 
 wp.set_module_options({"enable_backward": False})
 
+RUN = wp.constant(32)  # values that a thread looks at: four launches for a large picture
+
 
 @wp.kernel
 def is_marked_kernel(first: int, marks: wp.array(dtype=wp.uint8), value: int, out_one: wp.array(dtype=int)):
@@ -97,6 +99,28 @@ def counted(marks: wp.array, value: int) -> wp.array:
     count = wp.zeros(1, dtype=int, device=marks.device)
     launch(count_kernel, len(marks), [marks, value, count], marks.device)
     return count
+
+
+@wp.kernel
+def largest_kernel(first: int, values: wp.array(dtype=wp.vec3), out_largest: wp.array(dtype=wp.vec3)):
+    """One thread per `RUN` values: the largest of each of their numbers."""
+    i = first + wp.tid()
+    largest = values[i * RUN]
+    for k in range(i * RUN + 1, wp.min(i * RUN + RUN, values.shape[0])):
+        largest = wp.max(largest, values[k])
+    out_largest[i] = largest
+
+
+def largest(values: wp.array) -> wp.array:
+    """The largest first, second and third number of the elements of a vec3 array that is not empty, vec3 [1]."""
+    device = values.device
+    if not stays(device):
+        return wp.array(values.numpy().max(axis=0, keepdims=True), dtype=wp.vec3, device=device)
+    while len(values) > 1:
+        fewer = wp.empty(-(-len(values) // RUN), dtype=wp.vec3, device=device)
+        launch(largest_kernel, len(fewer), [values, fewer], device)
+        values = fewer
+    return values
 
 
 @wp.kernel

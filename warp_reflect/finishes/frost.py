@@ -13,10 +13,9 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import warp as wp
 
-from warp_reflect import launch
+from warp_reflect import compact, launch
 from warp_reflect.finishes.pyramid import Pyramid, empty_pyramid, halve, level_of, look_up_level, texel_of
 from warp_reflect.layers import CameraView
 from warp_reflect.scene import Scene
@@ -163,7 +162,8 @@ def correct_kernel(
     blurry: wp.array(dtype=wp.vec3),
     radius: float,
     count: int,
-    brightest: wp.vec3,
+    brightest_blurry: wp.array(dtype=wp.vec3),
+    brightest_ray: wp.array(dtype=wp.vec3),
     out_radiance: wp.array(dtype=wp.vec3),
 ):
     """One thread per pixel: adds the mean of what is missed over a disc around it, between black and the brightest."""
@@ -180,6 +180,7 @@ def correct_kernel(
     out_radiance[i] = blurry[i]
     if total[3] > LEAST_COVERAGE:
         corrected = blurry[i] + wp.vec3(total[0], total[1], total[2]) / total[3]
+        brightest = wp.max(brightest_blurry[0], brightest_ray[0])
         out_radiance[i] = wp.min(wp.max(corrected, wp.vec3(0.0, 0.0, 0.0)), brightest)
 
 
@@ -231,8 +232,8 @@ def corrected(scene: Scene, through: Through, found: Transmission, blurry: wp.ar
     launch.launch(missed_kernel, pixels.count, [view, pixels.pixel, blurry, rays, missed], device, threads)
     halve(missed, 1, device, threads)
     # Nothing sends out more than there is to be seen.
-    brightest = wp.vec3(*np.maximum(blurry.numpy().max(axis=0), rays.numpy().max(axis=0)).tolist())
+    brightest = compact.largest(blurry), compact.largest(rays)
     radiance = wp.empty(pixels.count, dtype=wp.vec3, device=device)
-    inputs = [view, missed, pixels.pixel, blurry, radius, LOOK_UPS, brightest, radiance]
+    inputs = [view, missed, pixels.pixel, blurry, radius, LOOK_UPS, *brightest, radiance]
     launch.launch(correct_kernel, pixels.count, inputs, device, threads)
     return radiance

@@ -521,5 +521,6 @@ def _looked_up(
     inputs = [scene.view, scene.lights, local.view, state, settings.parallax_steps, pixels.point, pixels.direction]
     inputs += [layer.triangle, layer.u, layer.v, layer.distance, layer.status, layer.radiance, settled]
     launch.launch(look_up_kernel, pixels.count, inputs, scene.device, settings.threads)
-    layer.statistics = statistics | {"local_settled": int(settled.numpy().sum())}
+    layer.statistics.update(statistics)
+    layer.statistics.later(lambda: {"local_settled": int(settled.numpy().sum())})
     return layer, local
