@@ -126,7 +126,8 @@ def solve_map_kernel(
             hidden = enters_reflector(map, eye, target)
         out_status[row] = wp.uint8(wp.where(hidden, HIDDEN, UNREFLECTED))
         return
-    r = search_newton(map, eye, target, first_guess(map, eye, target), settings.iterations, settings.tolerance)
+    seed = first_guess(map, eye, target)
+    r = search_newton(map, eye, target, seed, settings.iterations, settings.tolerance, 0.0)
     if closed == 0 and not on_reflector(map, r.p):
         out_status[row] = wp.uint8(UNREFLECTED)
         return

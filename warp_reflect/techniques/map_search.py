@@ -32,8 +32,12 @@ MIDPOINT_ITERATIONS = 9  # the paper's best setting (figure 8)
 STEP_CAP = wp.constant(0.7)  # of the whitened radius; keeps a Newton step on the visible side
 RETRY_SHRINK = wp.constant(0.4)
 SHRINK_MIN = wp.constant(1.0e-3)  # a step shortened to this share lowers nothing any more
+SHRINK_NEAR = wp.constant(0.1)  # likewise where the residual is ACCEPTED: what is left is the map's own roughness
 NORMAL_PART_MIN = wp.constant(1.0e-3)  # of |o + v|; below it the residual's tangent is not trusted
 SPD_SHARE = wp.constant(0.05)  # det J below this share of det H: take the safe step
+# Length of o + v where the path over a point is as good as straight. The root's path is no longer: on a convex body it grazes
+# as well, and what a picture shows of it is as good as the real point, with or without a second start.
+STRAIGHT = wp.constant(0.1)
 COARSE_NODES = wp.constant(7)  # per face edge of the fallback seed
 GAUGE_STEPS = wp.constant(10)  # of the bracket that finds the least gauge along a line of sight
 GAUGE_INSIDE = wp.constant(1.0e-4)  # gauge margin inside which a point counts as on the surface
@@ -246,13 +250,30 @@ def coarse_seed(map: ReflectorMapView, eye: wp.vec3, target: wp.vec3) -> wp.vec3
 
 
 @wp.func
+def is_straight(r: SearchResult, eye: wp.vec3, target: wp.vec3, straight: float) -> bool:
+    """True where eye, point and target lie on a line but for so much, see STRAIGHT."""
+    to_eye = eye - r.p
+    to_target = target - r.p
+    o = to_eye * (1.0 / wp.max(wp.length(to_eye), 1.0e-20))
+    v = to_target * (1.0 / wp.max(wp.length(to_target), 1.0e-20))
+    w = o + v
+    return wp.dot(w, w) < straight * straight
+
+
+@wp.func
 def search_newton(
-    map: ReflectorMapView, eye: wp.vec3, target: wp.vec3, seed: wp.vec3, evaluations: int, tolerance: float
+    map: ReflectorMapView,
+    eye: wp.vec3,
+    target: wp.vec3,
+    seed: wp.vec3,
+    evaluations: int,
+    tolerance: float,
+    straight: float,
 ) -> SearchResult:
     """Reflection point of a visible target: Newton steps, each shortened until it lowers the residual.
 
-    A search that ends far from a root starts once more from the coarse seed. One loop over samples for both starts:
-    everything is inlined, and a second copy of the body would double the compile time.
+    A search that ends far from a root, and not on a path as straight as `straight`, starts once more from the coarse seed. One
+    loop over samples for both starts: everything is inlined, and a second copy of the body would double the compile time.
     """
     best = SearchResult()
     best.residual = 1.0e30
@@ -271,10 +292,12 @@ def search_newton(
             shrink = 1.0
         else:
             shrink = shrink * RETRY_SHRINK
-        if best.residual <= tolerance:
+        if best.residual <= tolerance or (best.residual <= ACCEPTED and shrink < SHRINK_NEAR):
             break
         if attempt == 0 and (used >= evaluations or shrink < SHRINK_MIN):
             if best.residual <= ACCEPTED:
+                break
+            if best.residual > map.accepted and is_straight(best, eye, target, straight):
                 break
             attempt = 1
             used = evaluations
@@ -378,7 +401,7 @@ def search(
     """Reflection point of a visible target by the chosen search."""
     if settings.method == SEARCH_MIDPOINT:
         return search_midpoint(map, eye, target, seed, settings.iterations, settings.tolerance)
-    return search_newton(map, eye, target, seed, settings.iterations, settings.tolerance)
+    return search_newton(map, eye, target, seed, settings.iterations, settings.tolerance, STRAIGHT)
 
 
 @wp.func

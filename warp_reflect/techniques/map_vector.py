@@ -24,8 +24,10 @@ from warp_reflect.techniques.map_search import (
     NORMAL_PART_MIN,
     RETRY_SHRINK,
     SHRINK_MIN,
+    SHRINK_NEAR,
     SPD_SHARE,
     STEP_CAP,
+    STRAIGHT,
     UNREFLECTED,
     SearchSettings,
 )
@@ -218,7 +220,8 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
                     residual = pick(better, here, residual);
                     shrink = pick(better, F(1.0f), shrink * retry_shrink);
                     used += 1;
-                    going &= ~(residual <= settings.tolerance) & (shrink >= shrink_min) & (used < settings.iterations);
+                    const F least = pick(residual <= accepted, F(shrink_near), F(shrink_min));
+                    going &= ~(residual <= settings.tolerance) & (shrink >= least) & (used < settings.iterations);
                     const unsigned left = bits(going);
                     if (left == 0) break;
                     if (round < BLOCKS && __builtin_popcount(left) <= FEW) {
@@ -246,12 +249,19 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
             I done = asked & ~later & (residual <= accepted), answer = I(converged);
             I rest = asked & ~later & ~done;
             if (bits(rest) && !in_coarse) {
-                for (unsigned left = bits(rest); left != 0; left &= left - 1) {
+                // map_search.is_straight
+                const V to_eye = sub(eye, p), to_target = sub(target, p);
+                const V w = add(times(1.0f / fmax(length(to_eye), F(1.0e-20f)), to_eye),
+                    times(1.0f / fmax(length(to_target), F(1.0e-20f)), to_target));
+                const I again = rest & ~((residual > map.accepted) & (dot(w, w) < straight * straight));
+                for (unsigned left = bits(again); left != 0; left &= left - 1) {
                     const int l = __builtin_ctz(left);
                     for (int k = 0; k < 3; ++k) far[k][far_count] = row[k * ROW + l];
                     far_vertex[far_count++] = numbers[start + l];
                 }
-            } else if (bits(rest)) {
+                rest &= ~again;
+            }
+            if (bits(rest)) {
                 // map_search.solve_vertex: what is not near a root.
                 const Sample s = sample(best);
                 const Law law = measure(s, target);
@@ -299,6 +309,8 @@ def search_block(
     step_cap: float,
     retry_shrink: float,
     shrink_min: float,
+    shrink_near: float,
+    straight: float,
     accepted: float,
     estimate: float,
     grazing_cos: float,
@@ -344,6 +356,8 @@ def search_blocks_kernel(
         STEP_CAP,
         RETRY_SHRINK,
         SHRINK_MIN,
+        SHRINK_NEAR,
+        STRAIGHT,
         ACCEPTED,
         ESTIMATE,
         GRAZING_COS,
