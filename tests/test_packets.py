@@ -8,7 +8,7 @@ from test_shade import WHITE, ball_mesh, distant, dome, ground, look_at, place, 
 import warp_reflect as wr
 from warp_reflect import bvh, direct, raster, shadows, surface, vector
 from warp_reflect.launch import FINITE_FLAGS, launch
-from warp_reflect.layers import ReflectionLayer
+from warp_reflect.layers import MirrorPixels, ReflectionLayer
 from warp_reflect.scene import LightData, MaterialData
 from warp_reflect.settings import Status, Technique
 from warp_reflect.wide_packets import TRAVERSAL
@@ -317,6 +317,41 @@ def test_pixels_are_asked_in_tiles_each_once_as_one_by_one(asked, convex):
     for other in found[1:]:
         for got, expected in zip(other, found[0], strict=True):
             np.testing.assert_array_equal(got, expected)
+
+
+@pytest.mark.parametrize("width", [0, 70])
+def test_rays_through_a_body_are_followed_as_one_by_one(width):
+    """From its facets inwards and outwards, from points that lie a little off them."""
+    rng = np.random.default_rng(8)
+    scene, _ = lit_balls()
+    own, n = scene.parts[1], 3000
+    facet = rng.integers(own.first_triangle, own.first_triangle + own.triangle_count, n)
+    a, b, c = np.moveaxis(scene.host_points[scene.host_triangles[facet]].astype(np.float64), 1, 0)
+    u, v = np.sort(rng.random((2, n, 1)), axis=0)
+    normal = np.cross(b - a, c - a)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    inside = rng.random(n) < 0.5
+    normal[inside] *= -1.0
+    direction = rng.normal(size=(n, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    direction *= np.where((direction * normal).sum(axis=1) < 0.0, -1.0, 1.0)[:, None]
+    point = u * a + (v - u) * b + (1.0 - v) * c + rng.choice([-1e-3, 0.0, 1e-3], (n, 1)) * normal
+    vectors = [wp.array(np.float32(each), dtype=wp.vec3, device=CPU) for each in (point, normal, direction)]
+    pixels = MirrorPixels(1, wp.array(np.arange(n), dtype=int, device=CPU), *vectors, (0, 0, 1, 1))
+    start = [wp.array(facet, dtype=int, device=CPU), wp.array(inside, dtype=wp.uint8, device=CPU)]
+    some = wp.array(np.flatnonzero(rng.random(n) < 0.3), dtype=int, device=CPU)
+    for index in (None, some):
+        found = []
+        for kernels, threads in (("plain", 1), ("vector", 1), ("vector", 2)):
+            layer = ReflectionLayer.empty(pixels, Technique.RAYTRACED, CPU)
+            bvh.trace_transmitted(scene, layer, *start, threads, index, kernels, width)
+            found.append([getattr(layer, name).numpy() for name in ("triangle", "u", "v", "distance", "status")])
+        assert {Status.CONVERGED, Status.SKY} <= set(found[0][-1]) and (
+            (found[0][0] != facet) | (found[0][0] < 0)
+        ).all()
+        for other in found[1:]:
+            for got, expected in zip(other, found[0], strict=True):
+                np.testing.assert_array_equal(got, expected)
 
 
 @pytest.mark.parametrize("samples", [1, 5, 16, 40])

@@ -440,8 +440,9 @@ def trace_onward(
     facet: int,
     inside: int,
     t_first: float,
+    known: Met,
 ) -> RayHit:
-    """First surface along a ray that has gone through a surface; like `trace_ray` otherwise.
+    """First surface along a ray that has gone through a surface; like `trace_ray_from` otherwise.
 
     Args:
         mesh_id: `Tracer.id`.
@@ -453,6 +454,7 @@ def trace_onward(
         inside: 1: the ray is in the body that the facet belongs to. It does not enter that a second time, nor does a ray
             outside leave it a second time close by: a point polished onto an analytic surface is off its facets.
         t_first: What is nearer is not met.
+        known: What is met first where t_first is 0, if that was asked before.
     """
     result = RayHit()
     result.triangle = -1
@@ -466,15 +468,17 @@ def trace_onward(
     step = int(0)
     while step < MAX_STEPS:
         step += 1
-        query = wp.mesh_query_ray(mesh_id, start + t0 * d, d, FAR)
-        if not query.result:
+        met = known
+        if known.known == 0 or step > 1:
+            met = ask(mesh_id, start + t0 * d, d)
+        if met.triangle < 0:
             if asked != 0:
                 return result
             asked = int(1)
             d = moved_direction(d)
         else:
-            triangle = query.face
-            t = t0 + query.t
+            triangle = met.triangle
+            t = t0 + met.t
             tri = scene.triangles[triangle]
             a = scene.points[tri[0]]
             b = scene.points[tri[1]]
@@ -488,7 +492,7 @@ def trace_onward(
                 else:
                     step_over = leaves and t <= OWN_FACET_REACH * longest
             if not step_over:
-                return exact_hit(scene, triangle, origin, direction, t, query.u, query.v)
+                return exact_hit(scene, triangle, origin, direction, t, met.first, met.second)
             t0 = t + wp.max(ray_offset(start + t * d), offset)
     result.status = STEP_LIMIT
     return result
@@ -506,6 +510,7 @@ def trace_onward_kernel(
     inside: wp.array(dtype=wp.uint8),
     index: wp.array(dtype=int),
     indexed: int,
+    known: int,
     # Outputs:
     out_triangle: wp.array(dtype=int),
     out_u: wp.array(dtype=float),
@@ -519,7 +524,8 @@ def trace_onward_kernel(
         i = index[i]
         if i < 0:
             return
-    hit = trace_onward(mesh_id, scene, point[i], direction[i], normal[i], facet[i], int(inside[i]), 0.0)
+    met = answered(known, out_triangle[i], out_u[i], out_v[i], out_distance[i])
+    hit = trace_onward(mesh_id, scene, point[i], direction[i], normal[i], facet[i], int(inside[i]), 0.0, met)
     out_triangle[i] = hit.triangle
     out_u[i] = hit.u
     out_v[i] = hit.v
@@ -744,6 +750,7 @@ def _first_met(
     threads: int,
     kernels: str,
     width: int,
+    inside: wp.array | None = None,
 ) -> tuple[int, bool, bool]:
     """Answer rays of a layer in packets, where there are packets for it, see `bvh_vector.first_met`.
 
@@ -751,13 +758,20 @@ def _first_met(
         (1 if there are, else 0; whether any ray is left; whether any meets nothing).
     """
     pixels = layer.pixels
-    if not vector.chosen(kernels, scene.device) or not tracer.pays(pixels.count if index is None else len(index)):
+    count = pixels.count if index is None else len(index)
+    if count == 0:
+        return 0, False, False
+    if launch.stays(scene.device) or not vector.chosen(kernels, scene.device) or not tracer.pays(count):
         return 0, True, True
     from warp_reflect import bvh_vector  # not compiled where it is not asked for
 
     rays = [pixels.point, pixels.normal, pixels.direction]
     outputs = [layer.triangle, layer.u, layer.v, layer.distance, layer.status]
-    start = [*start, scene.view.triangle_patch]
+    start = [
+        *start,
+        scene.view.triangle_patch,
+        wp.empty(0, dtype=wp.uint8, device=scene.device) if inside is None else inside,
+    ]
     state = bvh_vector.first_met(
         tracer.packets, scene.triangle_records, rays, start, index, pixels.pixel, width, retry, outputs, threads
     )
@@ -771,6 +785,8 @@ def trace_transmitted(
     inside: wp.array,
     threads: int = 0,
     index: wp.array | None = None,
+    kernels: str = "auto",
+    width: int = 0,
 ) -> None:
     """Follow rays that have gone through a surface and write their hits into the layer.
 
@@ -782,15 +798,31 @@ def trace_transmitted(
         inside: uint8 [n], 1 where the ray is in the body of its facet.
         threads: CPU threads; 0: one per core.
         index: int32, which of the rays, each at most once, and -1 for none; None: all.
+        kernels: `Settings.kernels`.
+        width: Of the picture that the pixels are of; 0: not known.
     """
-    pixels = layer.pixels
-    count = pixels.count if index is None else len(index)
-    inputs = [wp.uint64(scene.tracer.id), scene.view, facet, pixels.point, pixels.normal, pixels.direction, inside]
-    inputs += [facet if index is None else index, int(index is not None)]
-    outputs = [layer.triangle, layer.u, layer.v, layer.distance, layer.status]
-    launch.launch(trace_onward_kernel, count, inputs + outputs, scene.device, threads, split_min=TRACE_SPLIT_MIN)
+    pixels, device = layer.pixels, scene.device
+    start = [facet, wp.empty(0, dtype=int, device=device), OwnBody(), _part_bodies(scene)]
+    known, left, _ = _first_met(scene, scene.tracer, layer, start, index, True, threads, kernels, width, inside)
+    if left:
+        some = [facet if index is None else index, int(index is not None)]
+        if known:
+            some = _with_status(layer, index, Status.NONE)
+        count = len(some[0]) if some[1] else pixels.count
+        inputs = [wp.uint64(scene.tracer.id), scene.view, facet, pixels.point, pixels.normal, pixels.direction, inside]
+        inputs += [*some, known, layer.triangle, layer.u, layer.v, layer.distance, layer.status]
+        launch.launch(trace_onward_kernel, count, inputs, device, threads, split_min=TRACE_SPLIT_MIN)
     if scene.has_hole is not None:
         _past_holes(scene, layer, scene.tracer, facet, inside=inside, threads=threads)
+
+
+def _part_bodies(scene: Scene) -> wp.array:
+    """Of every patch the part that it belongs to, as an `OwnBody`."""
+    bodies = np.zeros(max(len(scene.patch_shapes), 1), OwnBody.numpy_dtype())
+    for part in scene.parts:
+        own = list(part.patches)
+        bodies["first_triangle"][own], bodies["triangle_count"][own] = part.first_triangle, part.triangle_count
+    return wp.array(bodies, dtype=OwnBody, device=scene.device)
 
 
 def _past_holes(scene: Scene, layer: ReflectionLayer, tracer: Tracer, facet: wp.array, *more, **options) -> None:

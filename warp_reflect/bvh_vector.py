@@ -234,7 +234,7 @@ _CONSTANTS = f"""
             }
             I first = I(body.first_triangle), length = I(body.triangle_count);
             if (bodies.shape[0] > 0) {
-                const I patch = igather(patches.data, facet);
+                const I patch = igather(patches.data, ipick(facet < 0, I(0), facet));
                 EACH_LANE {
                     first[l] = bodies.data[patch[l]].first_triangle;
                     length[l] = bodies.data[patch[l]].triangle_count;
@@ -242,7 +242,18 @@ _CONSTANTS = f"""
             }
             Met& m = met[g];
             const I hit = m.face >= 0;
-            const I left = live[g] & hit & ((m.face == facet) | ((m.face >= first) & (m.face < first + length)));
+            I over = (m.face >= first) & (m.face < first + length);
+            if (inside.shape[0] > 0 && bits(over)) {
+                // bvh.trace_onward
+                V v0, v1, v2;
+                corners(records.data, ipick(hit, m.face, I(0)), v0, v1, v2);
+                const I leaves = dot(facet_normal(v0, v1, v2), d[g]) > 0.0f;
+                const F longest = fmax(fmax(size(sub(v1, v0)), size(sub(v2, v1))), size(sub(v0, v2)));
+                I in;
+                EACH_LANE in[l] = inside.data[own[g][l]] != 0 ? -1 : 0;
+                over &= (in ^ leaves) & (m.t <= 2.0f * longest);
+            }
+            const I left = live[g] & hit & ((m.face == facet) | over);
             const F warp_t = m.t, warp_u = m.u, warp_v = m.v;
             finish(hit & ~left, from[g], along[g], m);
             m.face = ipick(left & moved[g], I(UNASKED), m.face);
@@ -291,6 +302,7 @@ def first_met_block(
     body: OwnBody,
     bodies: wp.array(dtype=OwnBody),
     patches: wp.array(dtype=int),
+    inside: wp.array(dtype=wp.uint8),
     index: wp.array(dtype=int),
     indexed: int,
     numbers: wp.array(dtype=int),
@@ -321,6 +333,7 @@ def first_met_blocks_kernel(
     body: OwnBody,
     bodies: wp.array(dtype=OwnBody),
     patches: wp.array(dtype=int),
+    inside: wp.array(dtype=wp.uint8),
     # Which are asked:
     index: wp.array(dtype=int),
     indexed: int,
@@ -350,6 +363,7 @@ def first_met_blocks_kernel(
         body,
         bodies,
         patches,
+        inside,
         index,
         indexed,
         numbers,
@@ -384,7 +398,8 @@ def first_met(
         records: `Scene.triangle_records`.
         rays: vec3 each: points, normals on the rays' side, unit directions.
         start: Where they start: facets; int32, where among these that of each ray is, none: in order; the body of all of
-            them; bodies of patches, none: that body; the patches of triangles.
+            them; bodies of patches, none: that body; the patches of triangles; uint8, where rays have gone through a
+            surface: 1 where they are in its body (`bvh.trace_onward`), none: they are reflected.
         index: int32, which of the rays; None: all.
         numbers: int32, the pixels of rays.
         width: Of their picture, whose tiles stay together where the pixels of the rays asked ascend; 0: there is none.

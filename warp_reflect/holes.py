@@ -173,7 +173,9 @@ def go_past_kernel(
         holes += 1
         t0 = beyond_hole(point[i], direction[i], wp.max(hit.t, t0))
         if inside.shape[0] > 0:
-            hit = bvh.trace_onward(mesh_id, scene, point[i], direction[i], normal[i], facet[start], int(inside[i]), t0)
+            hit = bvh.trace_onward(
+                mesh_id, scene, point[i], direction[i], normal[i], facet[start], int(inside[i]), t0, bvh.Met()
+            )
         else:
             hit = bvh.trace_ray(mesh_id, scene, point[i], direction[i], normal[i], facet[start], own, 1, t0)
     if holes == HOLES_MAX:

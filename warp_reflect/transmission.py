@@ -557,7 +557,7 @@ def look_through(
     if follow is not None:
         follow(layer, facet, inside)
     else:
-        bvh.trace_transmitted(scene, layer, facet, inside, threads)
+        bvh.trace_transmitted(scene, layer, facet, inside, threads, None, settings.kernels, gbuffer.camera.size[0])
     return Transmission(surface, layer, weight, inside, wp.zeros(n, dtype=float, device=device))
 
 
@@ -662,7 +662,7 @@ def behind(
         )
         facet, inside = taken(layer.triangle), taken(inside)
         layer = ReflectionLayer.empty(pixels, Technique.RAYTRACED, device)
-        bvh.trace_transmitted(scene, layer, facet, inside, threads)
+        bvh.trace_transmitted(scene, layer, facet, inside, threads, None, settings.kernels, gbuffer.camera.size[0])
         seen = met(layer)
     if near is not None:
         launch.launch(mean_nearness_kernel, count, [near, nearness], device, threads)

@@ -232,13 +232,13 @@ def follow(
         inside: uint8 [n], 1 where the ray is in the body of its facet.
         settings: `edge_px`, `walk_hops`, `refine`, threads, kernels.
     """
-    found = under(scene, part)
+    found, width = under(scene, part), gbuffer.camera.size[0]
     eye = gbuffer.camera.eye - scene.origin
     height = 0.0
     if found is not None and len(found.triangles):
         height = float((eye - found.point) @ found.normal)
     if height <= 0.0 or gbuffer.camera.orthographic:
-        bvh.trace_transmitted(scene, layer, facet, inside, settings.threads)
+        bvh.trace_transmitted(scene, layer, facet, inside, settings.threads, None, settings.kernels, width)
         return
     ior = scene.data.materials[scene.parts[part].material].ior
     frame = [wp.vec3(*found.point), wp.vec3(*found.normal), height, float(ior)]
@@ -263,7 +263,7 @@ def follow(
     none = wp.empty(0, dtype=wp.uint8, device=device)
     caution = refine.fixed_caution(True, False, device)
     doubtful = refine.settle(scene, gbuffer, layer.pixels, target, mesh, layer, none, settings, caution)
-    bvh.trace_transmitted(scene, layer, facet, inside, threads, doubtful)
+    bvh.trace_transmitted(scene, layer, facet, inside, threads, doubtful, settings.kernels, width)
     layer.statistics.later(lambda: {"drawn": int(drawn.numpy().sum()), "vertices": mesh.vertex_count})
 
 
