@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 import warp as wp
 
+from warp_reflect import launch
+
 ROOT = Path(__file__).parent.parent
 
 wp.set_module_options({"enable_backward": False})
@@ -34,6 +36,7 @@ def indexed_kernel(first: int, out_sum: wp.array(dtype=float)):
 @pytest.mark.parametrize(
     ("registers", "arch", "share"),
     [
+        # In blocks of 256 threads:
         # By hand: 65,536 registers are 2,048 threads of 32, 1,024 of 64; a block is 8 warps.
         (32, 80, 1.0),
         (33, 80, 0.75),  # 40 a thread, of which a quarter's 16,384 hold 12 warps
@@ -50,7 +53,29 @@ def indexed_kernel(first: int, out_sum: wp.array(dtype=float)):
     ],
 )
 def test_occupancy_is_what_registers_leave(cubins, registers, arch, share):
-    assert cubins.occupancy(registers, arch) == pytest.approx(share)
+    assert cubins.occupancy(registers, arch, 256) == pytest.approx(share)
+    assert cubins.occupancy(registers, arch) >= cubins.occupancy(registers, arch, 256)
+
+
+def test_smaller_blocks_leave_less_of_a_multiprocessor_idle(cubins):
+    """168 registers a thread are 5,376 a warp, three of which fit into a quarter; of blocks of 8 warps one fits, of 4 three."""
+    assert (cubins.occupancy(168, 90, 256), cubins.occupancy(168, 90)) == (0.125, 0.1875)
+    assert cubins.occupancy(launch.MOST_REGISTERS, 120) == 0.25 > cubins.occupancy(launch.MOST_REGISTERS + 1, 120)
+    most = [max(cubins.occupancy(registers, 90, block) for block in (64, 256)) for registers in range(16, 256)]
+    assert all(cubins.occupancy(16 + k, 90) >= share for k, share in enumerate(most))
+
+
+def test_a_kernel_told_to_gets_no_more_registers_than_the_most(cubins, monkeypatch):
+    told = launch.few_registers(wp.Kernel(indexed_kernel.func, key="indexed_kernel", module=wp.get_module("told")))
+    told.module.options["enable_backward"] = False
+    monkeypatch.setattr(launch, "MOST_REGISTERS", 24)
+    fewer = launch.few_registers(wp.Kernel(indexed_kernel.func, key="indexed_kernel", module=wp.get_module("fewer")))
+    fewer.module.options["enable_backward"] = False
+    used = {}
+    for kernel in (told, fewer):
+        monkeypatch.setattr(cubins.kernels, "modules_of", lambda name, kernel=kernel: [kernel.module])
+        used[kernel] = cubins.kernels_of("indexed", [90])["indexed_kernel"][90].registers
+    assert used[fewer] <= 24 < used[told] <= 168
 
 
 def test_an_indexed_array_stands_on_the_stack_and_is_no_spill(cubins, monkeypatch):

@@ -9,7 +9,7 @@ stacks of Warp's ray queries); what the stack has beyond them are spilled regist
 Registers and stack stand in the section `.nv.info` of the binary, arrays in the PTX.
 
 Occupancy by CUDA's Occupancy Calculator (CUDA C++ Best Practices Guide, "Calculating Occupancy"): registers are handed out to
-warps in units of 256, warps to the four parts of a multiprocessor; a block of `BLOCK_DIM` threads, Warp's own, holds no shared
+warps in units of 256, warps to the four parts of a multiprocessor; a block of `launch.CUDA_BLOCK_DIM` threads holds no shared
 memory here. Limits of an architecture: CUDA C++ Programming Guide, "Technical Specifications per Compute Capability".
 """
 
@@ -27,6 +27,7 @@ from pathlib import Path
 import warp as wp
 
 from warp_reflect import kernels
+from warp_reflect.launch import CUDA_BLOCK_DIM
 
 # Compute capability times ten to (warps, blocks) that a multiprocessor holds at most; every one has 65,536 registers.
 LIMITS = {
@@ -39,7 +40,7 @@ LIMITS = {
     120: (48, 24),
 }
 REGISTERS, REGISTER_UNIT, PARTS = 65536, 256, 4
-WARP, BLOCK_DIM = 32, 256  # threads
+WARP = 32  # threads
 # The plain kernels that draw a frame; the vector ones are the CPU's.
 FRAME = (
     "raster",
@@ -134,12 +135,12 @@ def made(module: wp.Module, arch: int, suffix: str) -> list[bytes]:
         return [Path(path).read_bytes() for path in paths if Path(path).suffix == suffix]
 
 
-def occupancy(registers: int, arch: int) -> float:
+def occupancy(registers: int, arch: int, block_dim: int = CUDA_BLOCK_DIM) -> float:
     """Share of an architecture's warps that a multiprocessor holds of a kernel of that many registers a thread."""
     warps, blocks = LIMITS[arch]
     of_warp = -(-registers * WARP // REGISTER_UNIT) * REGISTER_UNIT
     held = REGISTERS // PARTS // of_warp * PARTS
-    of_block = BLOCK_DIM // WARP
+    of_block = block_dim // WARP
     return min(held // of_block, warps // of_block, blocks) * of_block / warps
 
 

@@ -802,7 +802,8 @@ def trace_transmitted(
         width: Of the picture that the pixels are of; 0: not known.
     """
     pixels, device = layer.pixels, scene.device
-    start = [facet, wp.empty(0, dtype=int, device=device), OwnBody(), _part_bodies(scene)]
+    bodies = scene.kept("bodies of parts", None, lambda: _part_bodies(scene))
+    start = [facet, wp.empty(0, dtype=int, device=device), OwnBody(), bodies]
     known, left, _ = _first_met(scene, scene.tracer, layer, start, index, True, threads, kernels, width, inside)
     if left:
         some = [facet if index is None else index, int(index is not None)]

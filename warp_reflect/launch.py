@@ -24,6 +24,11 @@ SPLIT_MIN = 4096  # elements below which the hand-off (20-60 us) costs more than
 # launches, it plans nothing: a frame's plan is the same in all of them.
 CORES_VARIABLE = "WARP_REFLECT_THREADS"
 CPU_BLOCK_DIM = 1  # what Warp launches with on the CPU
+# Threads of a block on CUDA. Of Warp's own 256 a multiprocessor holds one block where a thread has more than 128 registers, and
+# leaves idle what is not a whole one: with 160 it holds 8 warps of 256, 12 of 128 (`tools/cubin_registers.py`).
+CUDA_BLOCK_DIM = 128
+# A thread's at which three warps fit into each quarter of a multiprocessor: 16,384 are handed out in units of 256 a warp.
+MOST_REGISTERS = 168
 SLICE_ALIGN = 64  # elements; slices that share a cache line of 4-byte results would ping-pong it
 
 # Warp's own default (the option replaces it) and one flag: without NaN the box test's min and max are single
@@ -125,7 +130,7 @@ def launch(kernel, count: int, inputs: list, device, threads: int = 0, split_min
     _load(kernel, device)
     step = slice_length(count, device, threads, split_min)
     if step >= count:
-        wp.launch(kernel, dim=count, inputs=[0, *inputs], device=device)
+        wp.launch(kernel, dim=count, inputs=[0, *inputs], device=device, **_blocks(device))
         return
     run_parallel(
         [
@@ -133,6 +138,16 @@ def launch(kernel, count: int, inputs: list, device, threads: int = 0, split_min
             for first in range(0, count, step)
         ]
     )
+
+
+def few_registers(kernel: wp.Kernel) -> wp.Kernel:
+    """A decorator over `wp.kernel`'s: on CUDA a thread gets at most `MOST_REGISTERS`; versions of Warp that cannot ignore it."""
+    kernel.options["cuda_max_registers"] = MOST_REGISTERS
+    return kernel
+
+
+def _blocks(device) -> dict[str, int]:
+    return {"block_dim": CUDA_BLOCK_DIM} if wp.get_device(device).is_cuda else {}
 
 
 def launch_bands(kernel, ranges: list[tuple[int, int]], bands: list[tuple[int, int]], inputs: list, device) -> None:
@@ -145,7 +160,7 @@ def launch_bands(kernel, ranges: list[tuple[int, int]], bands: list[tuple[int, i
 
     def draw(band: tuple[int, int]) -> None:
         for first, length in ranges:
-            wp.launch(kernel, dim=length, inputs=[first, *inputs, *band], device=device)
+            wp.launch(kernel, dim=length, inputs=[first, *inputs, *band], device=device, **_blocks(device))
 
     run_parallel([partial(draw, band) for band in bands])
 

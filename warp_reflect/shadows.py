@@ -285,6 +285,7 @@ def shared_rays_kernel(
             out_around.shared[k, place] = wp.uint8(entry)
 
 
+@launch.few_registers
 @wp.kernel(module=PLAIN)
 def shadowed_kernel(
     first: int,

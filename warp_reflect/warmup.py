@@ -57,7 +57,8 @@ def warm_all(device: wp.DeviceLike, threads: int = 0) -> tuple[list[str], float]
         for loading in launch.ready(modules, device):
             loading.result()
     else:
-        wp.force_load(device, modules, max_workers=launch.thread_count("cpu", threads))
+        workers = launch.thread_count("cpu", threads)
+        wp.force_load(device, modules, block_dim=launch.CUDA_BLOCK_DIM, max_workers=workers)
     return names, perf_counter() - start
 
 

@@ -19,7 +19,7 @@ import warp as wp
 
 from warp_reflect import vector
 from warp_reflect.bodies import weld
-from warp_reflect.launch import launch, module_part
+from warp_reflect.launch import few_registers, launch, module_part
 from warp_reflect.layers import Camera, CameraView, GBuffer, MirrorPixels, ReflectionLayer, Reflector
 from warp_reflect.reflector_maps import ReflectorMap, ReflectorMapView
 from warp_reflect.scene import PartRange, Scene
@@ -46,6 +46,7 @@ PLAIN = module_part(__name__, "plain")  # what vector kernels do elsewhere
 HELD_MIN = 0.25  # of a mirror's area; where its sheets hold less, nearly all of it would be traced anyway
 
 
+@few_registers
 @wp.kernel(module=PLAIN)
 def search_kernel(
     first: int,
