@@ -329,10 +329,8 @@ def reflect(
         # A frame that was to keep nothing did not store where its virtual vertices lie.
         if history and keeping and len(history.vertices.position):
             curvature = greatest_curvature * unit_per_scene
-            reused, reused_px = reuse.keep(
-                scene, mesh.points, camera, gbuffer.view, history, curvature, settings, vertices
-            )
-            layer.statistics.update(reused=reused, reused_px=reused_px)
+            reused = reuse.keep(scene, mesh.points, camera, gbuffer.view, history, curvature, settings, vertices)
+            layer.statistics.later(reused)
         cull.settle_unseen(scene, part, vertices)
         if reflector.convex:
             culled = cull.settle_culled(scene, solve_apart, pixels, camera, unit_per_scene, vertices)

@@ -16,6 +16,8 @@ body's greatest curvature bounds it, a plane's virtual vertices stay. Seen from 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import warp as wp
 
 from warp_reflect.launch import launch
@@ -99,7 +101,7 @@ def keep(
     curvature: float,
     settings: Settings,
     out_vertex: VertexView,
-) -> tuple[int, float]:
+) -> Callable[[], dict]:
     """Settle the vertices whose virtual positions of the last frame are good enough; the others stay unsolved.
 
     Args:
@@ -111,12 +113,17 @@ def keep(
         out_vertex: One entry per point.
 
     Returns:
-        (vertices kept, the largest bound among them in pixels).
+        Gives, when it is called, `reused`: vertices kept, and `reused_px`: the largest bound among them.
     """
     pixels_per_radian = max(camera.fx, camera.fy)
     limit = settings.reuse_px / pixels_per_radian
     eye_before = wp.vec3(*(history.eye - scene.origin))
     inputs = [points, view, eye_before, curvature, limit, history.vertices, out_vertex]
     launch(keep_kernel, len(points), inputs, scene.device, settings.threads)
-    drift = out_vertex.drift.numpy()[out_vertex.status.numpy() == int(Status.CONVERGED)]
-    return len(drift), float(drift.max(initial=0.0)) * pixels_per_radian
+    status = wp.clone(out_vertex.status)  # what is solved later counts no more
+
+    def counted() -> dict:
+        drift = out_vertex.drift.numpy()[status.numpy() == int(Status.CONVERGED)]
+        return {"reused": len(drift), "reused_px": float(drift.max(initial=0.0)) * pixels_per_radian}
+
+    return counted
