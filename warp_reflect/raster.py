@@ -591,15 +591,17 @@ def rasterise(
 
 
 def nearest_first(survivors: wp.array, nearest: wp.array, ranges: list[tuple[int, int]]) -> wp.array:
-    """Survivors of a culling on the CPU, those with the nearest corners first: what lies behind them need not be drawn.
+    """Survivors of a culling on the CPU, the blocks with the nearest corners first: what lies behind need not be drawn.
 
-    Order counts half the bits of a key, which are sorted by their digits; of equal ones the order stays, and with it what
-    neighbours find in the caches.
+    Blocks stay together: neighbours in a mesh find each other's corners and pixels in the caches.
     """
     parts = [slice(begin, begin + count) for begin, count in ranges]
-    keys = np.concatenate([nearest.numpy()[part] for part in parts]).view(np.int32)
-    order = np.argsort(-(keys >> 16).astype(np.int16), kind="stable")
-    return wp.array(np.concatenate([survivors.numpy()[part] for part in parts])[order], dtype=int, device="cpu")
+    numbers = np.concatenate([survivors.numpy()[part] for part in parts])
+    keys = np.concatenate([nearest.numpy()[part] for part in parts])
+    whole = len(numbers) // vector.BLOCK * vector.BLOCK
+    order = np.argsort(-keys[:whole].reshape(-1, vector.BLOCK).max(axis=1), kind="stable")
+    blocks = numbers[:whole].reshape(-1, vector.BLOCK)[order].ravel()
+    return wp.array(np.concatenate([blocks, numbers[whole:]]), dtype=int, device="cpu")
 
 
 def row_bands(first: int, end: int, count: int) -> list[tuple[int, int]]:
