@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 PACKAGE = __package__
 FORWARD = ("techniques.forward", "techniques.virtual_mesh")
 ROW_MULTIPLE = 16  # `local_maps.ROW_MULTIPLE`, whose import would build Warp's modules before they are asked for
+FLAT_LIGHTS = {"rect", "disk", "cylinder"}  # of `direct.AREA_KINDS`: all but spheres
 # Name of a technique, or of an effect that is on, to kernel modules; a module's part stands after a slash, what is of vector
 # kernels alone after a bar, what is of plain ones after a minus.
 ROWS = {
@@ -94,6 +95,8 @@ def of_plan(plan: Plan) -> list[str]:
         cut = plan.scene.has_hole is not None
         sent = ["-direct", "|shadow_starts_vector", "-shadow_starts/plain", "|shadows_vector", "-shadows/plain"]
         asked += ["direct", "cut_shadows"] if cut else sent
+        if not cut and FLAT_LIGHTS & {light.kind for light in plan.scene.data.lights}:
+            asked.append("|shadow_starts_vector/flat")
     if seen:
         asked += ["-surface", "|surface_vector", "-surface/plain", "shade"]
     for row in seen:

@@ -15,6 +15,7 @@ from __future__ import annotations
 import warp as wp
 
 from warp_reflect.direct import Points
+from warp_reflect.launch import launch
 from warp_reflect.shadow_starts import Starts, row_vector
 
 wp.set_module_options({"enable_backward": False})
@@ -139,18 +140,29 @@ def shared_share(around: Neighbours, starts: Starts, k: int, place: int, i: int)
     return arrived / (float(LEVELS) * brought)
 
 
-def neighbours_of(points: Points, index: wp.array, area_count: int, shared: bool) -> Neighbours:
+@wp.kernel
+def image_index_kernel(first: int, pixel: wp.array(dtype=int), out_index: wp.array(dtype=int)):
+    """One thread per point of a mirror: where it lies in the image."""
+    i = first + wp.tid()
+    out_index[pixel[i]] = i
+
+
+def neighbours_of(points: Points, area_count: int, shared: bool, threads: int = 0) -> Neighbours:
     """Pictures of which nothing is known yet.
 
     Args:
         points: What is seen.
-        index: int32 [pixels], which point, -1: none; length 0: all pixels in order.
         area_count: Shapes that are asked.
         shared: Whether neighbours share what they find.
+        threads: CPU threads; 0: one per core.
     """
     device = points.triangle.device
     around = Neighbours()
-    around.width, around.pixel, around.index = points.width, points.pixel, index
+    around.width, around.pixel = points.width, points.pixel
+    around.index = wp.zeros(0, dtype=int, device=device)
+    if area_count and len(points.pixel):
+        around.index = wp.full(points.width * points.height, -1, dtype=int, device=device)
+        launch(image_index_kernel, len(points.pixel), [points.pixel, around.index], device, threads)
     size = (points.width + 2 * NEIGHBOURS) * (points.height + 2 * NEIGHBOURS) + MARGIN
     around.found = wp.zeros((area_count, size), dtype=wp.uint8, device=device)
     around.shared = wp.zeros((area_count if shared else 0, size), dtype=wp.uint8, device=device)

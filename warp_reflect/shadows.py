@@ -211,13 +211,6 @@ def area_share(mesh_id: wp.uint64, light: AreaView, start: RayStart, shift: wp.v
     return arrived / brought
 
 
-@wp.kernel
-def image_index_kernel(first: int, pixel: wp.array(dtype=int), out_index: wp.array(dtype=int)):
-    """One thread per point of a mirror: where it lies in the image."""
-    i = first + wp.tid()
-    out_index[pixel[i]] = i
-
-
 @wp.func
 def start_of(starts: Starts, i: int) -> RayStart:
     """Where a point's rays start; of the point itself nothing is kept."""
@@ -451,12 +444,8 @@ def shadowed_irradiance(
         inputs = [mesh, scene.view, lights, distant, areas, *at, cast.samples]
         cut_shadows.cut_irradiance(inputs, result, threads)
         return result
-    index = wp.zeros(0, dtype=int, device=device)
-    if any(cast.areas) and len(points.pixel):
-        index = wp.full(points.width * points.height, -1, dtype=int, device=device)
-        launch.launch(image_index_kernel, count, [points.pixel, index], device, threads)
     starts = starts_of(scene, points, normals, len(areas), threads, kernels=kernels)
-    around = neighbours_of(points, index, len(areas) if any(cast.areas) else 0, cast.shared)
+    around = neighbours_of(points, len(areas) if any(cast.areas) else 0, cast.shared, threads)
     samples = first_count(cast.samples), shared_count(cast.samples) if cast.shared else 0, cast.samples
     send = _irradiance
     if vector.chosen(kernels, device):

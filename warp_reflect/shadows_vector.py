@@ -10,7 +10,7 @@ import warp as wp
 
 from warp_reflect import vector
 from warp_reflect.direct import CYLINDER, SPHERE, DirectView
-from warp_reflect.launch import FINITE_FLAGS, launch
+from warp_reflect.launch import launch
 from warp_reflect.shadow_neighbours import (
     DARK,
     FLATNESS,
@@ -27,7 +27,7 @@ from warp_reflect.shadow_neighbours import (
 from warp_reflect.shadow_starts import Starts
 from warp_reflect.wide_packets import TRAVERSAL
 
-wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FINITE_FLAGS})
+wp.set_module_options({"enable_backward": False})
 
 BLOCK_SPLIT_MIN = 8  # blocks; what `bvh.TRACE_SPLIT_MIN` rays are
 # What `send_blocks_kernel` does.
