@@ -106,6 +106,8 @@ HELD = {
     "traced": ("one_mirror", "reference", {}, 1, 64, 0),
     "quadric": ("one_mirror", "quadric", {}, 2, 64, 0),
     "reflector map": ("one_mirror", "reflector_map", {}, 2, 64, 0),
+    # Which piece holds a pixel, and what branches end in, is found out on the host.
+    "pieces": ("torus", "reflector_map", {}, 40, 400_000, 400_000),
     "reuse": ("one_mirror", "quadric", {"reuse_px": 0.5}, 2, 64, 0),
     "local maps": ("one_mirror", "layered_environment", {"environment_resolution": 32}, 1, 64, 0),
     "mirrors in mirrors": ("kitchen", "auto", {}, 7, 128, 0),

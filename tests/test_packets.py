@@ -298,7 +298,8 @@ def test_pixels_are_asked_in_tiles_each_once_as_one_by_one(asked, convex):
     camera = look_at((0, 1.2, 2.0), (0, 0.8, 0), fov=50, size=(161, 90))
     gbuffer = raster.draw_scene(scene, camera)
     pixels = surface.mirror_pixels(scene, gbuffer, {1: 1})[0][1]
-    pixels = pixels.select(np.flatnonzero(rng.random(pixels.count) < 0.8), 1, camera.size[0])
+    some = np.flatnonzero(rng.random(pixels.count) < 0.8).astype(np.int32)
+    pixels = pixels.select(wp.array(some, dtype=int, device=pixels.pixel.device), 1, camera.size[0])
     index = {
         "all": None,
         "some": np.flatnonzero(rng.random(pixels.count) < 0.3),

@@ -6,6 +6,8 @@ at hand anyway NumPy finds the numbers faster than kernels do.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import warp as wp
 
@@ -142,6 +144,19 @@ def every(count: int, device) -> wp.array:
 def taken(array: wp.array, numbers: wp.array) -> wp.array:
     """The elements of an array with some numbers, in their order."""
     return wp.indexedarray(array, [numbers]).contiguous()
+
+
+def joined(arrays: Sequence[wp.array]) -> wp.array:
+    """Arrays of one kind, one after the other; a single one is itself."""
+    if len(arrays) == 1:
+        return arrays[0]
+    whole = wp.empty(sum(map(len, arrays)), dtype=arrays[0].dtype, device=arrays[0].device)
+    first = 0
+    for array in arrays:
+        if len(array):
+            wp.copy(whole, array, dest_offset=first, count=len(array))
+        first += len(array)
+    return whole
 
 
 def put(array: wp.array, numbers: wp.array, values: wp.array) -> None:

@@ -217,22 +217,17 @@ class MirrorPixels:
     def count(self) -> int:
         return len(self.pixel)
 
-    def select(self, chosen: np.ndarray, reflector: int, width: int) -> MirrorPixels:
+    def select(self, chosen: wp.array, reflector: int, width: int) -> MirrorPixels:
         """Some of the pixels under another id.
 
         Args:
-            chosen: Ascending indices into the pixels.
+            chosen: Ascending indices into the pixels, int32.
             reflector: The id they get.
             width: Of the image. [pixels]
         """
-        pixel = self.pixel.numpy()[chosen]
-        device = self.pixel.device
-        vectors = [
-            wp.array(array.numpy()[chosen], dtype=wp.vec3, device=device)
-            for array in (self.point, self.normal, self.direction)
-        ]
-        numbers = wp.array(pixel, dtype=int, device=device)
-        return MirrorPixels(reflector, numbers, *vectors, pixel_bounds(pixel, width))
+        arrays = (self.pixel, self.point, self.normal, self.direction)
+        pixel, *vectors = (compact.taken(array, chosen) for array in arrays)
+        return MirrorPixels(reflector, pixel, *vectors, pixel_bounds(pixel.numpy(), width))
 
 
 def pixel_bounds(pixel: np.ndarray, width: int) -> tuple[int, int, int, int]:

@@ -10,10 +10,9 @@ The data channels stay those of the smooth mirror.
 
 from __future__ import annotations
 
-import numpy as np
 import warp as wp
 
-from warp_reflect import bvh, launch, shade
+from warp_reflect import bvh, compact, launch, shade
 from warp_reflect.finishes.layer_map import (
     LayerMap,
     find_in_map,
@@ -88,18 +87,6 @@ def look_up_kernel(
         out_found[i] = wp.uint8(1)
 
 
-@wp.kernel
-def put_kernel(
-    first: int,
-    index: wp.array(dtype=int),
-    radiance: wp.array(dtype=wp.vec3),
-    out_radiance: wp.array(dtype=wp.vec3),
-):
-    """One thread per traced mirror pixel."""
-    i = first + wp.tid()
-    out_radiance[index[i]] = radiance[i]
-
-
 def apply(
     scene: Scene, shown: shade.Shown, layer: ReflectionLayer, sharp: wp.array, radiance: wp.array, row
 ) -> wp.array:
@@ -128,11 +115,10 @@ def turned_radiance(scene: Scene, shown: shade.Shown, layer: ReflectionLayer, ra
     launch.launch(
         look_up_kernel, pixels.count, [width, picture, pixels.pixel, direction, bumpy, found], device, threads
     )
-    left = np.flatnonzero(found.numpy() == 0).astype(np.int32)
+    left = compact.marked(found, 0)
     if len(left):
-        index = wp.array(left, dtype=int, device=device)
         rest = _traced(scene, shown, layer, turned.select(left, pixels.reflector, width), row)
-        launch.launch(put_kernel, len(left), [index, rest, bumpy], device, threads)
+        compact.put(bumpy, left, rest)
     layer.statistics["bumps_traced"] = len(left)
     return bumpy
 

@@ -15,7 +15,7 @@ from types import ModuleType
 import numpy as np
 import warp as wp
 
-from warp_reflect import bvh
+from warp_reflect import bvh, compact
 from warp_reflect.counts import add_statistics
 from warp_reflect.layers import Camera, GBuffer, MirrorPixels, ReflectionLayer, Reflector
 from warp_reflect.scene import Scene
@@ -64,32 +64,30 @@ def reflect(
     """
     part = scene.parts[reflector.part]
     width, height = gbuffer.camera.size
-    pixel = pixels.pixel.numpy()
-    numbers = _numbers(pieces, pixels, gbuffer.triangle.numpy()[pixel], part.first_triangle, part.triangle_count)
-    mask = np.zeros(width * height, np.int32)
-    mask[pixel] = numbers
-    masked = dataclasses.replace(gbuffer, reflector_id=wp.array(mask, dtype=int, device=scene.device))
+    facets = compact.taken(gbuffer.triangle, pixels.pixel).numpy()
+    numbers = _numbers(pieces, pixels, facets, part.first_triangle, part.triangle_count)
+    mask = wp.zeros(width * height, dtype=int, device=scene.device)
+    compact.put(mask, pixels.pixel, wp.array(numbers, dtype=int, device=scene.device))
+    masked = dataclasses.replace(gbuffer, reflector_id=mask)
     layer = ReflectionLayer.empty(pixels, method, scene.device)
-    whole = {name: getattr(layer, name).numpy().copy() for name in LAYER_ARRAYS}
     layer.history = {}
     layer.statistics["pieces"] = 0
     for number, piece in enumerate(pieces, 1):
-        chosen = np.flatnonzero(numbers == number)
-        if not len(chosen):
+        places = np.flatnonzero(numbers == number).astype(np.int32)
+        if not len(places):
             continue
+        chosen = wp.array(places, dtype=int, device=scene.device)
         own = pixels.select(chosen, number, width)
         before = (history or {}).get(number)
         answer = piece.technique.reflect(scene, piece.prepared, masked, own, camera, settings, before)
         for name in LAYER_ARRAYS:
-            whole[name][chosen] = getattr(answer, name).numpy()
+            compact.put(getattr(layer, name), chosen, getattr(answer, name))
         layer.history[number] = answer.history
         layer.virtual += answer.virtual
         layer.cells += answer.cells
         layer.statistics["pieces"] += 1
         add_statistics(layer.statistics, answer.statistics)
         add_statistics(layer.timings, answer.timings)
-    for name in LAYER_ARRAYS:
-        wp.copy(getattr(layer, name), wp.array(whole[name], dtype=getattr(layer, name).dtype, device=scene.device))
     left = wp.array(np.flatnonzero(numbers == 0).astype(np.int32), dtype=int, device=scene.device)
     traced = bvh.trace_pixels(
         scene,

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from warp_reflect import bvh, raster
+from warp_reflect import bvh, compact, raster
 from warp_reflect.launch import launch
 from warp_reflect.layers import Camera, CameraView, GBuffer, MirrorPixels, ReflectionLayer, Reflector, project
 from warp_reflect.optics import tangent_basis
@@ -454,7 +454,7 @@ def reflect_branches(
             offset += len(mesh.triangles)
             solved = vertices.status.numpy() == int(Status.CONVERGED)
             _add_doubt(doubt, mesh, vertices, solved, k, solve, unit_per_scene, camera, target.box)
-        together = _together([mesh for mesh, _ in branches])
+        together = _together([mesh for mesh, _ in branches], settings.refine == "off")
     layer.statistics.update(vertices=sum(mesh.vertex_count for mesh, _ in branches), drawn=drawn)
     if settings.refine == "off":
         with timer("candidates"):
@@ -530,21 +530,26 @@ def _cut_at_folds(scene: Scene, part, mesh: VirtualMesh, vertices: VertexView) -
     return virtual_mesh.cut_mesh(scene, part, cuts, mesh.estimated, mesh.relaxed)
 
 
-def _together(meshes: list[VirtualMesh]) -> VirtualMesh:
-    """Several virtual meshes as one, vertices and triangles numbered one after the other."""
-    device = meshes[0].parents.device
-    firsts = np.cumsum([0] + [mesh.vertex_count for mesh in meshes[:-1]])
-    host = np.concatenate([mesh.host_triangles + n for mesh, n in zip(meshes, firsts, strict=True)]).astype(np.int32)
+def _together(meshes: list[VirtualMesh], numbered: bool) -> VirtualMesh:
+    """Several virtual meshes as one, vertices and triangles one after the other.
+
+    Args:
+        numbered: With the corners of its triangles, which refinement does not ask for.
+    """
+    host = np.zeros((0, 3), np.int32)
+    if numbered:
+        firsts = np.cumsum([0] + [mesh.vertex_count for mesh in meshes[:-1]])
+        host = np.concatenate([mesh.host_triangles + n for mesh, n in zip(meshes, firsts, strict=True)])
     points, parents, patches = (
-        np.concatenate([getattr(mesh, name).numpy() for mesh in meshes]) for name in ("points", "parents", "patches")
+        compact.joined([getattr(mesh, name) for mesh in meshes]) for name in ("points", "parents", "patches")
     )
     return VirtualMesh(
-        wp.array(points, dtype=wp.vec3, device=device),
-        wp.array(host, dtype=wp.vec3i, device=device),
-        wp.array(parents, dtype=int, device=device),
-        wp.array(patches, dtype=int, device=device),
-        host,
+        points,
+        wp.array(host.astype(np.int32), dtype=wp.vec3i, device=parents.device),
         parents,
+        patches,
+        host,
+        np.concatenate([mesh.host_parents for mesh in meshes]),
         len(points),
         meshes[0].estimated,
         meshes[0].relaxed,
