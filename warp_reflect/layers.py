@@ -234,13 +234,14 @@ def pixel_bounds(pixel: np.ndarray, width: int) -> tuple[int, int, int, int]:
     """Half-open bounds (x0, y0, x1, y1) of ascending pixel numbers; all 0 if there are none."""
     if not len(pixel):
         return (0, 0, 0, 0)
-    column = pixel % width
-    return (
-        int(column.min()),
-        int(pixel[0]) // width,
-        int(column.max()) + 1,
-        int(pixel[-1]) // width + 1,
-    )
+    y0, y1 = int(pixel[0]) // width, int(pixel[-1]) // width + 1
+    # Of every row its first and its last pixel alone; of one type, or every number would be converted.
+    rows = np.arange(y0, y1 + 1, dtype=pixel.dtype) * pixel.dtype.type(width)
+    first = np.searchsorted(pixel, rows)
+    seen = first[1:] > first[:-1]
+    rows = rows[:-1][seen]
+    x0, x1 = (pixel[first[:-1][seen]] - rows).min(), (pixel[first[1:][seen] - 1] - rows).max() + 1
+    return int(x0), y0, int(x1), y1
 
 
 @dataclass(frozen=True)
