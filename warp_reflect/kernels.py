@@ -109,7 +109,7 @@ def of_plan(plan: Plan) -> list[str]:
         fits = any(each.local_edge % ROW_MULTIPLE == 0 and each.rem_count <= 2 for each in local)
         asked.append("|techniques.local_map_vector" if fits else "techniques.local_map")
     if any(pane.pixels > 0 for pane in plan.panes):
-        asked += ["transmission", "|transmission_vector"]
+        asked += ["transmission", "|transmission_vector", "|wide_tree", "|bvh_vector", "-bvh/onward"]
     return _of(asked, vector)
 
 
