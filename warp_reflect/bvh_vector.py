@@ -23,12 +23,13 @@ UNASKED = -2  # a triangle: nothing is known of what the ray meets
 # Pixels of a packet's part of the picture: as many as share most of a walk down the tree; a nearly square part meets few boxes.
 TILE_WIDTH, TILE_HEIGHT = 8, 4
 STRIP = 64  # pixels along a task's row of tiles
+JOINED = 16  # rays; tiles with fewer are joined with the next ones, as most of a walk costs the same for any number
 
 
 _CONSTANTS = f"""
     constexpr int NONE = {int(Status.NONE)}, CONVERGED = {int(Status.CONVERGED)}, SKY = {int(Status.SKY)};
     constexpr int LEFT = {LEFT}, MISSED = {MISSED}, UNASKED = {UNASKED};
-    constexpr int TILE_WIDTH = {TILE_WIDTH}, TILE_HEIGHT = {TILE_HEIGHT}, STRIP = {STRIP};
+    constexpr int TILE_WIDTH = {TILE_WIDTH}, TILE_HEIGHT = {TILE_HEIGHT}, STRIP = {STRIP}, JOINED = {JOINED};
 """
 
 
@@ -46,7 +47,7 @@ _CONSTANTS = f"""
     auto number_at = [&](int place) -> int { return numbers.data[ray_at(place)]; };
     // Rays that go together: those of a tile, row by row of either half, or the next of a block.
     constexpr int RAYS = TILE_WIDTH * TILE_HEIGHT, GROUPS = RAYS / LANES;
-    struct Tile { enum { value = GROUPS }; };
+    struct Tile { enum { value = GROUPS }; bool alone; bool first_alone() const { return alone; } };
     int ray[RAYS], taken = 0;
     // A tile that is full, whose rows of rays begin at these places.
     bool full = false;
@@ -79,55 +80,60 @@ _CONSTANTS = f"""
             while (taken < RAYS && next_place < last_place) ray[taken++] = ray_at(next_place++);
             return;
         }
-        int x = width;
-        for (int row = 0; row < TILE_HEIGHT; ++row) {
-            const int own = at[row] < stop[row] ? number_at(at[row]) - (top + row) * width : width;
-            x = own < x ? own : x;
-        }
-        if (x == width) return;
-        x -= (x - first_x) % TILE_WIDTH;
-        int middle[TILE_HEIGHT], end[TILE_HEIGHT], full_rows = 0;
-        for (int row = 0; row < TILE_HEIGHT; ++row) {
-            const int own = (top + row) * width + x;
-            int k = at[row];
-            if (k + TILE_WIDTH <= stop[row] && number_at(k + TILE_WIDTH - 1) == own + TILE_WIDTH - 1) {
-                middle[row] = k + TILE_WIDTH / 2;
-                end[row] = k + TILE_WIDTH;
-                ++full_rows;
-                continue;
-            }
-            while (k < stop[row] && number_at(k) < own + TILE_WIDTH / 2) ++k;
-            middle[row] = k;
-            while (k < stop[row] && number_at(k) < own + TILE_WIDTH) ++k;
-            end[row] = k;
-        }
-        full = full_rows == TILE_HEIGHT && indexed == 0;
-        if (full) {
+        while (taken < JOINED) {
+            int x = width;
             for (int row = 0; row < TILE_HEIGHT; ++row) {
-                row_start[row] = at[row];
-                at[row] = end[row];
-                // The rays beside it and their answers' places are fetched while these are on their way.
-                if (end[row] == stop[row]) continue;
-                const int next = end[row];
-                for (int line = 0; line < 32; line += 16) {
-                    __builtin_prefetch(points + 3 * next + line);
-                    __builtin_prefetch(normals + 3 * next + line);
-                    __builtin_prefetch(directions + 3 * next + line);
-                }
-                __builtin_prefetch(facets.data + (pixel.shape[0] > 0 ? pixel.data[next] : next));
-                __builtin_prefetch(out_triangle.data + next, 1);
-                __builtin_prefetch(out_u.data + next, 1);
-                __builtin_prefetch(out_v.data + next, 1);
-                __builtin_prefetch(out_t.data + next, 1);
-                __builtin_prefetch(out_status.data + next, 1);
+                const int own = at[row] < stop[row] ? number_at(at[row]) - (top + row) * width : width;
+                x = own < x ? own : x;
             }
-            taken = RAYS;
-            return;
+            if (x == width) return;
+            x -= (x - first_x) % TILE_WIDTH;
+            int middle[TILE_HEIGHT], end[TILE_HEIGHT], full_rows = 0;
+            for (int row = 0; row < TILE_HEIGHT; ++row) {
+                const int own = (top + row) * width + x;
+                int k = at[row];
+                if (k + TILE_WIDTH <= stop[row] && number_at(k + TILE_WIDTH - 1) == own + TILE_WIDTH - 1) {
+                    middle[row] = k + TILE_WIDTH / 2;
+                    end[row] = k + TILE_WIDTH;
+                    ++full_rows;
+                    continue;
+                }
+                while (k < stop[row] && number_at(k) < own + TILE_WIDTH / 2) ++k;
+                middle[row] = k;
+                while (k < stop[row] && number_at(k) < own + TILE_WIDTH) ++k;
+                end[row] = k;
+            }
+            full = full_rows == TILE_HEIGHT && indexed == 0 && taken == 0;
+            if (full) {
+                for (int row = 0; row < TILE_HEIGHT; ++row) {
+                    row_start[row] = at[row];
+                    at[row] = end[row];
+                    // The rays beside it and their answers' places are fetched while these are on their way.
+                    if (end[row] == stop[row]) continue;
+                    const int next = end[row];
+                    for (int line = 0; line < 32; line += 16) {
+                        __builtin_prefetch(points + 3 * next + line);
+                        __builtin_prefetch(normals + 3 * next + line);
+                        __builtin_prefetch(directions + 3 * next + line);
+                    }
+                    __builtin_prefetch(facets.data + (pixel.shape[0] > 0 ? pixel.data[next] : next));
+                    __builtin_prefetch(out_triangle.data + next, 1);
+                    __builtin_prefetch(out_u.data + next, 1);
+                    __builtin_prefetch(out_v.data + next, 1);
+                    __builtin_prefetch(out_t.data + next, 1);
+                    __builtin_prefetch(out_status.data + next, 1);
+                }
+                taken = RAYS;
+                return;
+            }
+            int more = 0;
+            for (int row = 0; row < TILE_HEIGHT; ++row) more += end[row] - at[row];
+            if (taken + more > RAYS) return;
+            for (int half = 0; half < 2; ++half)
+                for (int row = 0; row < TILE_HEIGHT; ++row)
+                    for (int k = half ? middle[row] : at[row]; k < (half ? end[row] : middle[row]); ++k) ray[taken++] = ray_at(k);
+            for (int row = 0; row < TILE_HEIGHT; ++row) at[row] = end[row];
         }
-        for (int half = 0; half < 2; ++half)
-            for (int row = 0; row < TILE_HEIGHT; ++row)
-                for (int k = half ? middle[row] : at[row]; k < (half ? end[row] : middle[row]); ++k) ray[taken++] = ray_at(k);
-        for (int row = 0; row < TILE_HEIGHT; ++row) at[row] = end[row];
     };
     // Of a full tile rays follow one another in fours, which begin there: rows are read and turned.
     auto four_of = [&](int lane) -> int { return row_start[lane / 4 % TILE_HEIGHT] + lane / 4 / TILE_HEIGHT * 4; };
@@ -200,7 +206,7 @@ _CONSTANTS = f"""
         }
         for (int round = 0; round < 2; ++round) {
             Met found[GROUPS];
-            traverse(Nearest{}, Tile{}, missed, o, d, reach, found);
+            traverse(Nearest{}, Tile{taken <= LANES}, missed, o, d, reach, found);
             I some = I(0);
             for (int g = 0; g < GROUPS; ++g) {
                 Met& m = met[g];

@@ -109,8 +109,9 @@ RAYS = r"""
     };
     struct Nearest { enum { value = 1 }; };
     struct Any { enum { value = 0 }; };
-    struct One { enum { value = 1 }; };
-    struct Two { enum { value = 2 }; };
+    // How many vectors of rays go together, and whether those after the first are empty.
+    struct One { enum { value = 1 }; static constexpr bool first_alone() { return false; } };
+    struct Two { enum { value = 2 }; static constexpr bool first_alone() { return false; } };
     (void)flushed; (void)slab;
 #define EACH_GROUP _Pragma("clang loop unroll(full)") for (int g = 0; g < GROUPS; ++g)
 """

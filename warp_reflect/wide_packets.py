@@ -39,9 +39,16 @@ TRAVERSAL = (
         constexpr bool NEAREST = decltype(nearest)::value;
         Way ray[GROUPS];
         I left[GROUPS], octant[GROUPS];
+        const bool alone = groups.first_alone();
         EACH_GROUP {
-            ray[g] = way_of(o[g], d[g]);
             left[g] = live[g];
+            if (g > 0 && alone) {
+                ray[g] = ray[0];
+                octant[g] = I(0);
+                met[g] = met[0];
+                continue;
+            }
+            ray[g] = way_of(o[g], d[g]);
             met[g] = Met{I(-1), reach[g], F(0.0f), F(0.0f)};
             octant[g] = ipick(d[g].x < 0.0f, I(1), I(0)) + ipick(d[g].y < 0.0f, I(2), I(0)) + ipick(d[g].z < 0.0f, I(4), I(0));
         }
@@ -162,9 +169,14 @@ TRAVERSAL = (
                     const float* of = tree_nodes + next.child;
                     const int child = ((const int*)of)[48];
                     I asked[GROUPS], any = I(0);
-                    EACH_GROUP {
-                        asked[g] = mask[g] & box(ray[g], met[g].t, of);
-                        any |= asked[g];
+                    if (alone) {
+                        EACH_GROUP asked[g] = I(0);
+                        asked[0] = any = mask[0] & box(ray[0], met[0].t, of);
+                    } else {
+                        EACH_GROUP {
+                            asked[g] = mask[g] & box(ray[g], met[g].t, of);
+                            any |= asked[g];
+                        }
                     }
                     if (!bits(any)) continue;
                     if (child >= 0) { node = child; break; }
