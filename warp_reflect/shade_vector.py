@@ -11,6 +11,7 @@ import warp as wp
 
 from warp_reflect import vector
 from warp_reflect.direct import AreaView
+from warp_reflect.direct_vector import SPHERES
 from warp_reflect.layers import CameraView, GBuffer, ReflectionLayer
 from warp_reflect.scene import Scene, SceneView
 from warp_reflect.shade import LightView
@@ -21,7 +22,8 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func_native(
     vector.snippet(
-        r"""
+        SPHERES
+        + r"""
     const float pi = 3.14159265358979f;
     const int count = triangle.shape[0];
     const int begin = block * BLOCK;
@@ -64,31 +66,6 @@ wp.set_module_options({"enable_backward": False})
             }
         }
         return radiance;
-    };
-    // direct.sphere_irradiance; lanes that see a part of a sphere below their horizon take their time.
-    auto sphere_irradiance = [&](I mask, const auto& area, V p, V n) -> F {
-        const V to_centre = sub(spread(area.centre), p);
-        const F distance = __builtin_elementwise_sqrt(dot(to_centre, to_centre));
-        const F cosine = clip(dot(to_centre, n) / distance, -1.0f, 1.0f);
-        const F sine_sphere = area.radius / distance;
-        const F square = sine_sphere * sine_sphere;
-        const I within = distance <= area.radius;
-        const I above = cosine >= sine_sphere;
-        F total = pick(within, F(pi), pick(above, pi * square * cosine, F(0.0f)));
-        for (unsigned left = bits(mask & ~within & ~above & (cosine > -sine_sphere)); left != 0; left &= left - 1) {
-            const int l = __builtin_ctz(left);
-            const float c = cosine[l], s2 = square[l];
-            const float from_sine = 1.0f - c * c, from_sphere = 1.0f / s2 - 1.0f;
-            const float sine = __builtin_sqrtf(from_sine > 0.0f ? from_sine : 0.0f);
-            const float x = __builtin_sqrtf(from_sphere > 0.0f ? from_sphere : 0.0f);
-            float y = -x * c / (sine > 1.0e-30f ? sine : 1.0e-30f);
-            y = y < -1.0f ? -1.0f : y > 1.0f ? 1.0f : y;
-            const float rest = 1.0f - y * y;
-            const float root = sine * __builtin_sqrtf(rest > 0.0f ? rest : 0.0f);
-            const float sum = (c * __builtin_acosf(y) - x * root) * s2 + __builtin_atan2f(root, x);
-            total[l] = sum > 0.0f ? sum : 0.0f;
-        }
-        return total;
     };
     struct Lit { V base, mirror; };
     // What lanes `seen` of points `own`, from `start` on, on triangles `tri` give back along unit rays: base radiance and

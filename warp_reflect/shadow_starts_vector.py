@@ -11,7 +11,7 @@ import warp as wp
 from warp_reflect import vector
 from warp_reflect.bvh import FLOAT_EPS, OFFSET_ULPS
 from warp_reflect.direct import SPHERE, DirectView, Points, area_irradiance
-from warp_reflect.hits_vector import HITS
+from warp_reflect.direct_vector import SPHERES
 from warp_reflect.launch import launch, module_part
 from warp_reflect.layers import CameraView
 from warp_reflect.scene import SHAPE_QUADRIC, Scene, SceneView
@@ -23,8 +23,38 @@ FLAT = module_part(__name__, "flat")
 
 @wp.func_native(
     vector.snippet(
-        HITS
+        SPHERES
         + r"""
+// A loop over lanes that is kept one: unrolled, it would take long to compile.
+#define LANE_BY_LANE _Pragma("clang loop unroll(disable)") for (int l = 0; l < LANES; ++l)
+    // The quadrics of the patches of some lanes: rows and shifts of `unit_from_scene`, and a, b, c.
+    struct Quadric { V row[3]; F shift[3], a, b, c; };
+    auto quadric_of = [&](I patch, bool alone) -> Quadric {
+        const auto* patches = scene.patches.data;
+        float rows[15 * LANES];
+        LANE_BY_LANE {
+            if (alone && l > 0) break;
+            const auto& each = patches[patch[l]];
+            for (int k = 0; k < 12; ++k) rows[k * LANES + l] = each.unit_from_scene.data[k / 4][k % 4];
+            for (int k = 0; k < 3; ++k) rows[(12 + k) * LANES + l] = each.quadric[k];
+        }
+        auto field = [&](int k) -> F { return alone ? F(rows[k * LANES]) : load(rows + k * LANES); };
+        Quadric of;
+        _Pragma("clang loop unroll(full)") for (int k = 0; k < 3; ++k) {
+            of.row[k] = V{field(4 * k), field(4 * k + 1), field(4 * k + 2)};
+            of.shift[k] = field(4 * k + 3);
+        }
+        of.a = field(12); of.b = field(13); of.c = field(14);
+        return of;
+    };
+    // Point p in the frame of its quadric.
+    auto in_quadric = [&](const Quadric& of, V p) -> V {
+        return V{dot(of.row[0], p) + of.shift[0], dot(of.row[1], p) + of.shift[1], dot(of.row[2], p) + of.shift[2]};
+    };
+    // A vector of the frame of a quadric as one of the scene.
+    auto from_quadric = [&](const Quadric& of, V g) -> V {
+        return add(add(times(g.x, of.row[0]), times(g.y, of.row[1])), times(g.z, of.row[2]));
+    };
     const int count = triangle.shape[0];
     const int begin = block * BLOCK;
     const int end = begin + BLOCK < count ? begin + BLOCK : count;
