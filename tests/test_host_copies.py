@@ -11,7 +11,8 @@ import pytest
 import warp as wp
 
 import warp_reflect as wr
-from warp_reflect import counts, launch, timing
+from warp_reflect import counts, launch, shade, timing
+from warp_reflect.techniques import TECHNIQUES
 
 ROOT = Path(__file__).parent.parent
 SIZE = 160, 90
@@ -99,6 +100,37 @@ def test_numbers_are_found_out_once_and_when_asked():
     total["walk"] += 1
     del total["bvh"]
     assert dict(total) == {"reused_px": 0.5, "walk": 9, "culled": 3} and asked == ["first"] and len(total) == 3
+
+
+RECORDS_CPU = tuple(int(part) for part in wp.__version__.split(".")[:2]) >= (1, 19)  # Warp's graphs, on a CPU too
+
+
+@pytest.mark.parametrize("method", ["reference", "environment"])
+def test_what_follows_the_mirrors_pixels_is_launches_alone(method, host_copies):
+    """No copy and no wait: all of it can be recorded as one graph, which shows the frame when it is played."""
+    scene = wr.load_stage(ROOT / "usd_scenes" / "one_mirror.usda")
+    with launch.as_device():
+        plan = wr.make_plan(scene, size=SIZE, settings=wr.Settings(kernels="plain", threads=1), method=method)
+        frame = wr.render_frame(scene, plan)
+        (row,) = plan.rows
+        prepared, pixels = plan.prepared(row), frame.layers[row.reflector.id].pixels
+
+        def steps() -> wp.array:
+            reflected = TECHNIQUES[row.technique].reflect(
+                scene, prepared, frame.gbuffer, pixels, frame.camera, row.settings, None
+            )
+            layers = {row.reflector.id: reflected}
+            return shade.shade(scene, frame.gbuffer, layers, 1, plan.shadows, kernels="plain")[0]
+
+        with host_copies.counted() as copies:
+            picture = steps()
+        assert not copies
+        if RECORDS_CPU:
+            with wp.ScopedCapture(device="cpu") as capture:
+                picture = steps()
+            picture.zero_()
+            wp.capture_launch(capture.graph)
+    np.testing.assert_array_equal(picture.numpy().reshape(frame["RGBA"].shape), frame["RGBA"])
 
 
 # Stage, method, settings: reads and bytes of a warm frame at most, and bytes written.
