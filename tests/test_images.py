@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from PIL import Image
 
 from warp_reflect import images
 
@@ -48,25 +49,32 @@ def test_exr_has_the_named_channels_with_half_colour_and_float_data(tmp_path):
 
 
 TOLD = """
+import json
 import sys
 import numpy as np
 from pathlib import Path
 from warp_reflect import images
 
 def write(k):
-    images.write_exr("a.exr", {"Z": np.zeros((2, 2))}, attributes={"warp_reflect:plan": {"step": f"{k} " * 50_000}})
+    header = {"warp_reflect:plan": {"step": f"{k} " * 50_000}}
+    if sys.argv[1] == "exr":
+        images.write_exr("a.exr", {"Z": np.zeros((2, 2))}, attributes=header)
+    else:
+        images.write_png("a.png", np.zeros((2, 2)), {name: json.dumps(value) for name, value in header.items()})
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
 
 sizes = [write(1000 + k) for k in range(120)]
-_, attributes = images.read_exr("a.exr")
+attributes = images.check_whole("a." + sys.argv[1])
 print(max(sizes[20:]) - max(sizes[:20]), attributes["warp_reflect:plan"] == {"step": "1119 " * 50_000})
 """
 
 
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="resident memory is read from Linux' /proc")
-def test_texts_of_written_files_are_not_kept(tmp_path):
+@pytest.mark.parametrize("ending", ["exr", "png"])
+def test_texts_of_written_files_are_not_kept(tmp_path, ending):
     # OpenImageIO keeps all it is shown: here 250 kB a file, 25 MB in all.
-    told = subprocess.run([sys.executable, "-c", TOLD], cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+    program = [sys.executable, "-c", TOLD, ending]
+    told = subprocess.run(program, cwd=tmp_path, capture_output=True, text=True, check=True).stdout
     grown, same = told.split()
     assert same == "True"
     assert int(grown) < 4e6
@@ -80,6 +88,15 @@ def test_header_entries_of_any_name_and_length_are_written(tmp_path):
         assert attributes["Copyright"] == "nobody"
         assert attributes["warp_reflect:one"] == "a"
         assert attributes["warp_reflect:long"] == "ä" * 300
+
+
+def test_texts_of_a_png_are_read_here_and_elsewhere(tmp_path):
+    told = {"warp_reflect:key": "0123abcd", "Title": "Ä\n", "Comment": "x" * 5000}
+    images.write_png(tmp_path / "a.png", np.full((3, 4, 3), 0.5), told)
+    with Image.open(tmp_path / "a.png") as picture:
+        picture.load()
+        assert {name: picture.text[name] for name in told} == told
+    assert images.check_whole(tmp_path / "a.png")["warp_reflect:key"] == "0123abcd"
 
 
 def test_exr_round_trip_keeps_data_exactly_and_attributes(tmp_path):

@@ -11,6 +11,7 @@ import hashlib
 import json
 import os
 import stat
+import zlib
 from collections.abc import Collection, Iterator, Mapping
 from itertools import count
 from pathlib import Path
@@ -28,12 +29,14 @@ SIDE_LIMIT = 32768  # pixels
 # Rows that are put together and handed over at once, for each thread of the writer: one ZIP block of an EXR. More would be
 # turned into pixels in main memory instead of in a core's own.
 ROWS_AT_ONCE = 16
-# OpenImageIO keeps every text that it is ever shown until the process ends: the plans of 500 frames are 5 MB. So it is shown
-# stand-ins, which differ by their length alone, in steps of so many bytes where JSON may be filled up with blanks.
+# OpenImageIO keeps every text that it is ever shown until the process ends: the plans of 500 frames are 5 MB, and every one,
+# however short, splits a hole of the heap that the next frame's arrays had fitted in. So it is shown stand-ins, which differ by
+# their length alone, in steps of so many bytes where JSON may be filled up with blanks.
 TEXT_STEP = 256
 STAND_IN = "-"
 OWN_ENTRIES = "warp_reflect:"  # the library gives names that it knows (Copyright) others in the file
-HEADER_START = 8  # bytes: an EXR's magic number and version
+EXR_START = 8  # bytes: magic number and version
+PNG_START = 33  # bytes: signature and first chunk
 
 # x and y of red, green, blue and white: ITU-R BT.709.
 REC709_PRIMARIES = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
@@ -243,9 +246,8 @@ def write_png(path: str | os.PathLike, rgb: np.ndarray, attributes: Mapping[str,
     spec.attribute("oiio:ColorSpace", "srgb_rec709_scene")
     spec.attribute("oiio:UnassociatedAlpha", 1)
     spec.attribute("DateTime", "")
-    for name, value in (attributes or {}).items():
-        spec.attribute(name, str(value))
-    _write_whole(Path(path), "png", [(spec, [pixels[..., k] for k in range(channel_count)])])
+    texts = {name: str(value).encode() for name, value in (attributes or {}).items()}
+    _write_whole(Path(path), "png", [(spec, [pixels[..., k] for k in range(channel_count)])], texts)
     return replaced
 
 
@@ -393,13 +395,25 @@ def _filled_up(text: bytes) -> bytes:
     return text.ljust(-(-len(text) // TEXT_STEP) * TEXT_STEP)
 
 
-def _put_texts(file: BinaryIO, texts: Mapping[str, bytes]) -> None:
+def _put_png_texts(file: BinaryIO, texts: Mapping[str, bytes]) -> None:
+    """Put texts in a PNG between its first chunk and the next (PNG Specification, 11.3.4)."""
+    start, rest = file.read(PNG_START), file.read()
+    file.seek(0)
+    file.write(start)
+    for name, text in texts.items():
+        kind, between = (b"tEXt", b"\0") if text.isascii() else (b"iTXt", b"\0\0\0\0\0")
+        content = kind + name.encode() + between + text
+        file.write((len(content) - 4).to_bytes(4) + content + zlib.crc32(content).to_bytes(4))
+    file.write(rest)
+
+
+def _put_exr_texts(file: BinaryIO, texts: Mapping[str, bytes]) -> None:
     """Put texts in the place of their stand-ins of the same length in the first header of an EXR.
 
     An entry of a header is its name and its type, a zero byte after either, the length of its value in 4 bytes, and the
     value; an empty name ends the header (OpenEXR File Layout).
     """
-    file.seek(HEADER_START)
+    file.seek(EXR_START)
     left = dict(texts)
     while name := _until_zero(file):
         kind = _until_zero(file)
@@ -413,6 +427,9 @@ def _put_texts(file: BinaryIO, texts: Mapping[str, bytes]) -> None:
         file.seek(end)
     if left:
         raise OSError(f"header entries {', '.join(left)} were left out")
+
+
+PUT_TEXTS = {"openexr": _put_exr_texts, "png": _put_png_texts}
 
 
 def _until_zero(file: BinaryIO) -> bytes:
@@ -450,7 +467,7 @@ def _part_mark(path: Path) -> str:
 def _write_whole(path: Path, format_name: str, parts: list[tuple], texts: Mapping[str, bytes] | None = None) -> None:
     """Write (spec, planes) parts under a passing name, read back, sync and rename: a reader never meets half a file.
 
-    `texts` are put in the place of their stand-ins after the reading back, which keeps them too.
+    `texts` are put in its header after the reading back, which would keep them, too.
 
     The PNG writer returns success on a full disk and only `geterror` tells; a cut EXR keeps a valid header.
     """
@@ -478,7 +495,7 @@ def _write_whole(path: Path, format_name: str, parts: list[tuple], texts: Mappin
         _check_last_rows(path, part, specs)
         with open(part, "r+b") as file:
             if texts:
-                _put_texts(file, texts)
+                PUT_TEXTS[format_name](file, texts)
             file.flush()
             os.fsync(file.fileno())
         os.replace(part, final)
