@@ -7,18 +7,23 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from warp_reflect.budget import Costs, Work, map_blur_px, predict
+from warp_reflect.budget import BEND_LEAST, BENDS, BENDS_PER_OCTAVE, Costs, Work, map_blur_px, predict
 from warp_reflect.launch import thread_count
 from warp_reflect.layers import Camera, Reflector
-from warp_reflect.scene import Scene
+from warp_reflect.scene import PartRange, Scene
 from warp_reflect.settings import Settings
 from warp_reflect.techniques import MAPS, TECHNIQUES
+from warp_reflect.techniques.vertices import ESTIMATE
+from warp_reflect.techniques.virtual_mesh import CUT_SLACK
 
 PREFERRED = ("planar", "quadric", "reflector_map")  # the exact and cheap first
 JUDGED_IN_PIXELS = ("planar", "quadric")  # whether they apply depends on the view
 # Triangles. Finding out what a larger mesh is (a quadric, convex sheets) takes seconds: `auto` leaves it where the outcome
 # is several sheets at best, or would lose against tracing even if it were one.
 ANALYSED_MAX = 20000
+BENT_TRIANGLES = 8192  # of a scene, that are asked how they bend
+NEAREST = 0.05  # of a mirror's size: what lies nearer, or is met at a lesser cosine, counts as if there
+HIDDEN_SHARE = 0.8  # of a mirror's size: what lies behind a disc of that radius is hidden
 # Of the error looked for: a bound on the parallax, from boxes alone, that is not worth a closer look.
 PARALLAX_SLACK = 8.0
 
@@ -64,6 +69,7 @@ def work_of(
         sheets and module.has_branches(scene, reflector, camera),
         _size_px(pixels),
         parallax,
+        _bends(scene, part, camera, pixels) if technique != "planar" and technique not in MAPS else (),
     )
 
 
@@ -120,6 +126,45 @@ def far_environment(
         return None
     reason = f"all it shows is far: a map at its centre is off by {error:.2g} px, texels included"
     return Candidate("environment", reason, work)
+
+
+def _bends(scene: Scene, part: PartRange, camera: Camera, pixels: int) -> tuple[float, ...]:
+    """`Work.bends` of a mirror as if it were a ball of its box's size, by some of the scene's triangles.
+
+    The estimate of `vertices.edge_reach`; what the body hides is left out, and of a mirror that is partly seen the part not
+    seen.
+    """
+    if part.is_whole:
+        mine = scene.host_points[part.first_vertex : part.first_vertex + part.vertex_count].astype(np.float64)
+    else:
+        own = scene.host_triangles[part.first_triangle : part.first_triangle + part.triangle_count]
+        mine = scene.host_points[np.unique(own)].astype(np.float64)
+    low, high = mine.min(axis=0), mine.max(axis=0)
+    extents = np.sort(0.5 * (high - low))
+    size, centre = extents[2], 0.5 * (low + high)
+    if not size > 0.0:
+        return ()
+    ids = np.arange(0, scene.triangle_count, -(-scene.triangle_count // BENT_TRIANGLES))
+    share = scene.triangle_count / len(ids)
+    ids = ids[(ids < part.first_triangle) | (ids >= part.first_triangle + part.triangle_count)]
+    corner = [(scene.host_points[each] - centre) / size for each in scene.host_triangles[ids].T]
+    longest = np.sqrt(np.max([np.sum((corner[k] - corner[k - 1]) ** 2, axis=1) for k in range(3)], axis=0))
+    middle = sum(corner) / 3.0
+    eye = (camera.eye - scene.origin - centre) / size
+    eye_far, far = np.linalg.norm(eye), np.linalg.norm(middle, axis=1)
+    cosine = middle @ eye / np.maximum(eye_far * far, 1.0e-30)
+    hidden = (cosine < 0.0) & ((1.0 - cosine**2) * far**2 < HIDDEN_SHARE**2)
+    radius = float(np.cbrt(np.prod(extents / size)))
+    d_o, d_v = max(eye_far - radius, NEAREST), np.maximum(far - radius, NEAREST)
+    incidence = np.sqrt(np.maximum(0.5 * (1.0 + cosine), NEAREST**2))
+    least = incidence**2 * (1.0 / d_o + 1.0 / d_v) + 2.0 * incidence
+    focal = math.sqrt(camera.fx * camera.fy)
+    wanted = longest * np.sqrt(CUT_SLACK * focal) / (d_v * np.sqrt(float(ESTIMATE) * d_o * least))
+    whole = math.pi * extents[1] * size * camera.fx * camera.fy / (size * eye_far) ** 2
+    share *= min(1.0, pixels / whole)
+    steps = np.floor(BENDS_PER_OCTAVE * np.log2(np.maximum(wanted[~hidden], 1.0e-9) / BEND_LEAST))
+    steps = np.minimum(steps[steps >= 0.0], BENDS - 1.0).astype(np.int64)
+    return tuple(float(count) for count in share * np.bincount(steps, minlength=BENDS))
 
 
 def _size_px(pixels: int) -> float:

@@ -24,23 +24,23 @@ class Costs:
     """A ray for itself through a BVH of `TRACE_BASE` triangles; grows with their logarithm. Of a mirror's own: see `packed`."""
     mirrored: float = 0.16
     """A vertex mirrored in a plane."""
-    quadric_cold: float = 0.22
+    quadric_cold: float = 0.2
     """A vertex solved on a quadric, from nothing, boxes and the rest of a search's step included."""
-    quadric_warm: float = 0.17
+    quadric_warm: float = 0.1
     """The same from the last frame's answer."""
-    map_cold: float = 0.25
+    map_cold: float = 0.23
     """A vertex solved in a map, from nothing."""
-    map_warm: float = 0.21
+    map_warm: float = 0.11
     """The same from the last frame's answer."""
     branches: float = 7.0
     """A vertex whose every reflection point on a concave side is searched."""
-    bent: float = 0.07
-    """A vertex whose edges are looked at, whether they bend, on a frame that cuts anew."""
-    cut: float = 0.66
+    bent: float = 0.5
+    """A vertex of the scene on a frame that cuts anew: its edges are looked at, whether they bend, its triangles listed anew."""
+    cut: float = 0.27
     """A virtual vertex added where they do."""
-    draw: float = 0.083
+    draw: float = 0.11
     """A virtual triangle, the clipping at the hidden boundary included."""
-    covered: float = 0.11
+    covered: float = 0.05
     """A mirror pixel that virtual triangles are drawn into, those included that others hide."""
     interpolated: float = 0.33
     """A vertex interpolated from a grid."""
@@ -82,21 +82,27 @@ class Costs:
 BUILT_IN = Costs()
 TRACE_BASE = 65536  # triangles at which `Costs.trace` is told
 # A mirror's own rays go through the tree side by side, the cheaper the more of them meet the same triangles: at least this
-# share of `Costs.trace`, and more by the root of triangles per mirror pixel. Measured by `tools/bench_crossing.py`, 10^4 to 10^6
-# triangles by 10^3 to 10^6 pixels; beyond the last factor fixed costs hide the rest.
-PACKED_LEAST, PACKED_ROOT, PACKED_MOST = 0.25, 0.47, 3.0
+# share of `Costs.trace`, and more by the root of triangles per mirror pixel. Measured on this package's scenes, 5 * 10^3 to
+# 1.6 * 10^5 triangles by 10^3 to 3 * 10^5 pixels a mirror; beyond the last factor fixed costs hide the rest.
+PACKED_LEAST, PACKED_ROOT, PACKED_MOST = 0.15, 0.2, 1.3
 # Rays of a pixel of a rough mirror that are followed, by `effects.glossy_way`: `SAMPLES` of `finishes.glossy_gather` and of
 # `glossy_rays`, whose import would build Warp's modules before they are asked for.
 GLOSSY_RAYS = {"gather": 6, "accumulate": 256, "filter": 0, "prefiltered": 0, "off": 0}
 LOOKS = 16  # look-ups of what follows no ray that cost as much as a gathered ray's
 BOUNCE_LAYERS = 3.0  # of `Costs.layer`: a mirror that shows mirrors, beyond its rays; measured: 2.2 to 3 ms a mirror
+# Of `Costs.layer`: a mirror that is reflected forward takes some more steps; measured: 2 to 5 ms a mirror.
+FORWARD_LAYERS = 4.0
+# Of a hollow mirror the middles of cut edges and what is added are searched branch by branch.
+BRANCH_ADDED = 2.0
 COLD_SHARE = 0.1  # of frames that start from nothing: of those of a walk few do, a single picture does
-DOUBT_SHARE = 0.05  # of the mirror pixels that refinement leaves to the BVH, at the finest edges
-DOUBT_UNCUT = 0.3  # the same where edges are not cut
-# Virtual vertices, and as many triangles, that are added where edges bend: large triangles are cut, whose number grows little
-# with a scene's, into pieces whose number grows with the mirror's picture over the bend allowed. Measured on this package's
-# scenes: 170 to 430 for the first, 0.65 to 0.86 for the exponent; scenes of small triangles alone have a tenth.
-CUT_ADDED, CUT_POWER = 200.0, 0.85
+# Pixels that refinement leaves to the BVH: silhouettes, so many for the root of a mirror's own. Measured: 11 to 36.
+DOUBT_ROOT = 21.0
+DOUBT_UNCUT = 0.3  # share of the mirror pixels where edges are not cut
+# Triangles are cut where their edges' pictures bend: into pieces along an edge whose number grows with the bend over the one
+# allowed (`Work.bends`), less so than a triangle's own does, for what is measured bends less than what is estimated. Fitted to
+# 24 mirrors of this package's scenes at 320 and 960 pixels: most counts come out within a factor of 1.4, all within 2.5.
+CUT_SHARE, CUT_POWER, CUT_MOST = 0.55, 0.7, 32  # `virtual_mesh.CUT_MAX`
+BEND_LEAST, BENDS, BENDS_PER_OCTAVE = 0.25, 24, 2  # the first of the counts of `Work.bends`, and how many there are
 CUT_ADDED_MIN, CUT_ADDED_SHARE = 20000, 2.0  # `virtual_mesh.BUDGET_MIN`, BUDGET_SHARE
 GRID_NODES = 0.06  # solved per vertex at `GRID_BASE`, by the third power of the cell's edge
 GRID_BASE = 0.5  # pixels
@@ -144,6 +150,8 @@ class Work:
         held: Share of the mirror that the technique holds; the rest is traced, and the mirror may see itself.
         branches: It is seen from within, and every vertex may appear several times.
         size_px: Half extent of the mirror's picture. [pixels]
+        bends: Triangles by the pieces that their edges' pictures want at one pixel of bend: from BEND_LEAST on, BENDS_PER_OCTAVE
+            counts for every doubling.
         parallax_px: By how much a map of its environment errs. [pixels]
     """
 
@@ -156,6 +164,7 @@ class Work:
     branches: bool = False
     size_px: float = 0.0
     parallax_px: float = 0.0
+    bends: tuple[float, ...] = ()
 
 
 def predict(work: Work, technique: str, settings: Settings, costs: Costs = BUILT_IN, threads: int = 1) -> dict:
@@ -313,8 +322,8 @@ def _microseconds(work: Work, technique: str, settings: Settings, costs: Costs) 
         return shown, shown + local
     added = 0.0 if technique == "planar" else _added(work, settings)
     cold, warm = _search(work.vertices, added, technique, settings, costs)
-    every = costs.layer + (work.triangles + added) * costs.draw + work.pixels * costs.covered
-    every += work.pixels * (costs.candidate if settings.refine == "off" else _refined(settings, ray, costs))
+    every = FORWARD_LAYERS * costs.layer + (work.triangles + added) * costs.draw + work.pixels * costs.covered
+    every += work.pixels * costs.candidate if settings.refine == "off" else _refined(work.pixels, settings, ray, costs)
     cut = work.vertices * costs.bent + added * costs.cut if added else 0.0
     warm = work.passes * (every + warm)
     cold = work.passes * (every + cold + cut)
@@ -322,7 +331,7 @@ def _microseconds(work: Work, technique: str, settings: Settings, costs: Costs) 
     if work.held < 1.0 or work.passes > 1:
         rest += work.pixels * ((1.0 - work.held) * ray + costs.own_body)
     if work.branches:
-        rest += work.vertices * costs.branches + work.pixels * costs.own_body
+        rest += (work.vertices + BRANCH_ADDED * added) * costs.branches + work.pixels * costs.own_body
     return warm + rest, cold + rest
 
 
@@ -330,9 +339,14 @@ def _added(work: Work, settings: Settings) -> float:
     """Virtual vertices and triangles added to the scene's, where a curved mirror bends edges."""
     if settings.edge_px == 0.0:
         return 0.0
-    size = work.size_px or math.sqrt(work.pixels / math.pi)
-    wanted = CUT_ADDED * (size / settings.edge_px) ** CUT_POWER
-    return min(wanted, CUT_ADDED_MIN + CUT_ADDED_SHARE * work.triangles)
+    added = 0.0
+    for k, triangles in enumerate(work.bends):
+        wanted = BEND_LEAST * 2.0 ** ((k + 0.5) / BENDS_PER_OCTAVE) / math.sqrt(settings.edge_px)
+        octaves = math.ceil(CUT_POWER * math.log2(CUT_SHARE * wanted))
+        if octaves > 0:
+            pieces = min(2**octaves, CUT_MOST)
+            added += triangles * 0.5 * (pieces + 1) * (pieces + 2)
+    return min(added, CUT_ADDED_MIN + CUT_ADDED_SHARE * work.triangles)
 
 
 def _search(vertices: int, added: float, technique: str, settings: Settings, costs: Costs) -> tuple[float, float]:
@@ -353,9 +367,9 @@ def _search(vertices: int, added: float, technique: str, settings: Settings, cos
     return vertices * cold, (1.0 - kept) * (vertices * gridded + added * warm)
 
 
-def _refined(settings: Settings, ray: float, costs: Costs) -> float:
-    doubt = DOUBT_SHARE if settings.edge_px > 0.0 else DOUBT_UNCUT
-    return costs.refined * (1.25 if settings.refine == "strict" else 1.0) + doubt * ray
+def _refined(pixels: int, settings: Settings, ray: float, costs: Costs) -> float:
+    doubt = min(DOUBT_ROOT * math.sqrt(pixels), pixels) if settings.edge_px > 0.0 else DOUBT_UNCUT * pixels
+    return pixels * costs.refined * (1.25 if settings.refine == "strict" else 1.0) + doubt * ray
 
 
 def _error(work: Work, technique: str, settings: Settings) -> tuple[float, float]:

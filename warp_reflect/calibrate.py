@@ -51,6 +51,7 @@ LAMP = 1.0  # radius: penumbras are as wide as in rooms that are no tests
 GRID_PX = 0.5
 LOCAL_SIDE = 64  # texels along an edge of a local map
 UNBENT_PX = 1.0e4  # edges are looked at, none is cut
+SOME_PX = 0.5  # some are
 BENT_PX = 0.03  # as many vertices are added as there were
 
 
@@ -83,10 +84,10 @@ def _measure(device: str, repeats: int, told: Callable[[str], None]) -> Costs:
         found[f"{name}_cold"] = cold.us("reflect/search") / cold.scene_vertices
         found[f"{name}_warm"] = (warm.us("reflect/search") + warm.us("reflect/tessellate")) / warm.vertices
         if name == "map":
-            found["bent"] = cold.us("reflect/tessellate") / cold.scene_vertices
-            fine = _timed(ball, technique, repeats, edge_px=BENT_PX)
-            added = fine.us("reflect/tessellate") - cold.us("reflect/tessellate")
-            found["cut"] = added / max(fine.vertices - fine.scene_vertices, 1)
+            some, many = (_timed(ball, technique, repeats, edge_px=px) for px in (SOME_PX, BENT_PX))
+            added = [each.vertices - each.scene_vertices for each in (some, many)]
+            found["cut"] = (many.us("reflect/tessellate") - some.us("reflect/tessellate")) / max(added[1] - added[0], 1)
+            found["bent"] = (some.us("reflect/tessellate") - added[0] * found["cut"]) / some.scene_vertices
             small = _timed(ball, technique, repeats, warm=True, size=SMALL)
             found["draw"], found["covered"] = _drawn(small, warm)
             found["refined"] = warm.us("reflect/refine") / warm.pixels
