@@ -3,8 +3,9 @@
     python tools/bench_kernels.py usd_scenes/one_mirror.usda --size 1280x720 --rounds 7
 
 A row is a loop of the frame: its kernels' time with `kernels=plain` and `kernels=vector` (medians of this thread's processor
-time, so that others on the machine count less), their ratio, and elements a second. The last rows are the whole frame and,
-where it is installed, Embree's eye and mirror rays through embreex without shading (`peers.Wavefront`).
+time, so that others on the machine count less), their ratio, and elements a second. The rasteriser's rows have culling and
+order in them, not the projection of vertices; their elements are triangles, those that are culled too. The last rows are the
+whole frame and, where it is installed, Embree's eye and mirror rays through embreex without shading (`peers.Wavefront`).
 """
 
 from __future__ import annotations
@@ -23,9 +24,11 @@ import warp as wp
 sys.path.insert(0, str(Path(__file__).parent))
 from bench_frames import commit, machine, wavefront
 
-# Loop: kernels of either kind. The plain search runs after the vector one, for what that leaves.
+EYE, VIRTUAL = "rasterise, eye view", "rasterise, virtual"
+# Loop: kernels of either kind, or calls of the rasteriser. The plain search runs after the vector one, for what that leaves.
 LOOPS = {
-    "rasterise, eye and virtual": ("draw_kernel", "draw_blocks_kernel"),
+    EYE: (EYE,),
+    VIRTUAL: (VIRTUAL,),
     "meet the mirror": ("mirror_pixels_kernel", "mirror_blocks_kernel"),
     "search reflection points": ("search_kernel", "search_blocks_kernel"),
     "step from a grid's directions": ("direction_kernel", "direction_lanes_kernel"),
@@ -66,6 +69,7 @@ def main() -> None:
 def bench(arguments: argparse.Namespace) -> list[dict]:
     """Rows of one stage."""
     import warp_reflect as wr
+    from warp_reflect import raster
 
     spent: Counter = Counter()
     launch = wp.launch
@@ -75,7 +79,18 @@ def bench(arguments: argparse.Namespace) -> list[dict]:
         launch(kernel, dim=dim, inputs=inputs, device=device, **how)
         spent[kernel.key] += 1000.0 * (time.thread_time() - start)
 
-    wp.launch = timed
+    rasterise = raster.rasterise
+    triangles: Counter = Counter()
+
+    def timed_raster(target, screen, drawn, **how):
+        start = time.thread_time()
+        result = rasterise(target, screen, drawn, **how)
+        loop = VIRTUAL if target.view.ray.shape[0] > 0 else EYE
+        spent[loop] += 1000.0 * (time.thread_time() - start)
+        triangles[loop] += len(drawn)
+        return result
+
+    wp.launch, raster.rasterise = timed, timed_raster
     size = tuple(int(side) for side in arguments.size.split("x"))
     scene = wr.load_stage(arguments.stage)
     base = wr.Settings(threads=1, keep_static=False, shadows=False)
@@ -90,6 +105,7 @@ def bench(arguments: argparse.Namespace) -> list[dict]:
     for round_ in range(arguments.rounds + 1):
         for kernels, plan in plans.items():
             spent.clear()
+            triangles.clear()
             start = time.thread_time()
             frames[kernels] = wr.render_frame(scene, plan, previous=frames[kernels])
             if round_:
@@ -101,7 +117,7 @@ def bench(arguments: argparse.Namespace) -> list[dict]:
             if round_:
                 whole["wavefront"].append(1000.0 * (time.thread_time() - start))
     pixels, mirror = size[0] * size[1], sum(layer.pixels.count for layer in frames["vector"].layers.values())
-    elements = {
+    elements = dict(triangles) | {
         "meet the mirror": mirror,
         "search reflection points": frames["vector"].statistics.get("vertices", 0),
         "refine": mirror,
