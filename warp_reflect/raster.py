@@ -476,7 +476,9 @@ def ray_image_kernel(
     out_ray[2 * cell + 1] = wp.vec4(d[0], d[1], d[2], distance / wp.max(wp.dot(camera.forward, to_eye), 1.0e-30))
 
 
-def attach_rays(target: Target, camera: CameraView, pixels: MirrorPixels, threads: int = 0) -> None:
+def attach_rays(
+    target: Target, camera: CameraView, pixels: MirrorPixels, threads: int = 0, kernels: str = "auto"
+) -> None:
     """Give a target the reflected rays of its pixels: triangles drawn into it are ordered by exact path length.
 
     Cells without a ray hold zeros.
@@ -485,7 +487,12 @@ def attach_rays(target: Target, camera: CameraView, pixels: MirrorPixels, thread
     target.view.ray = wp.zeros(2 * len(target.key), dtype=wp.vec4, device=device)
     x0, y0, x1, _ = target.box
     inputs = [camera, pixels.pixel, pixels.point, pixels.direction, x0, y0, x1 - x0, target.view.ray]
-    launch(ray_image_kernel, pixels.count, inputs, device, threads)
+    if vector.chosen(kernels, device):
+        from warp_reflect import raster_vector  # which draws with this module's functions
+
+        vector.launch_blocks(raster_vector.ray_blocks_kernel, pixels.count, inputs, device, threads)
+    else:
+        launch(ray_image_kernel, pixels.count, inputs, device, threads)
 
 
 @wp.kernel

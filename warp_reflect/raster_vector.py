@@ -18,6 +18,8 @@ from __future__ import annotations
 import warp as wp
 
 from warp_reflect import vector
+from warp_reflect.launch import module_part
+from warp_reflect.layers import CameraView
 from warp_reflect.raster import (
     GUARD,
     RAY_ALONG_MIN,
@@ -32,6 +34,7 @@ from warp_reflect.raster import (
 
 wp.set_module_options({"enable_backward": False})
 
+RAYS = module_part(__name__, "rays")
 BLOCK = wp.constant(vector.BLOCK)
 
 
@@ -689,3 +692,64 @@ def resolve_blocks_kernel(
 ):
     """As `raster.resolve_kernel`, one thread per block of pixels."""
     resolve_block((first + wp.tid()) * BLOCK, key, out_triangle, out_depth_key)
+
+
+@wp.func_native(
+    vector.snippet(r"""
+    const int end = begin + BLOCK < pixel.shape[0] ? begin + BLOCK : pixel.shape[0];
+    const float* points = (const float*)point.data;
+    const float* directions = (const float*)direction.data;
+    const V eye = spread(camera.eye), forward = spread(camera.forward);
+    for (int start = begin; start < end; start += LANES) {
+        const bool full = start + LANES <= end;
+        const int count = full ? LANES : end - start;
+        const I own = full ? start + lanes() : ipick(lanes() < count, start + lanes(), I(start));
+        const V p = vrows(points, start, full, own), d = vrows(directions, start, full, own);
+        const V to_eye = sub(p, eye);
+        const F distance = __builtin_elementwise_sqrt(dot(to_eye, to_eye));
+        const F unit_depth = distance / fmax(dot(forward, to_eye), F(1.0e-30f));
+        // Turned as they lie: eight numbers of a ray side by side.
+        float columns[8 * LANES];
+        const F column[8] = {p.x, p.y, p.z, distance, d.x, d.y, d.z, unit_depth};
+        for (int half = 0; half < LANES / 8; ++half) {
+            _Pragma("clang loop unroll(full)") for (int k = 0; k < 8; ++k) store(columns + LANES * k, column[k]);
+            int at[8];
+            for (int k = 0; k < 8; ++k) at[k] = LANES * k + 8 * half;
+            Row rows[8];
+            transposed(columns, at, rows);
+            for (int k = 0; k < 8 && 8 * half + k < count; ++k) {
+                const int i = pixel.data[start + 8 * half + k], row = i / camera.width;
+                const int cell = (row - y0) * box_width + i - row * camera.width - x0;
+                __builtin_memcpy((float*)out_ray.data + 8 * cell, &rows[k], sizeof(Row));
+            }
+        }
+    }
+""")
+)
+def ray_block(
+    begin: int,
+    camera: CameraView,
+    pixel: wp.array(dtype=int),
+    point: wp.array(dtype=wp.vec3),
+    direction: wp.array(dtype=wp.vec3),
+    x0: int,
+    y0: int,
+    box_width: int,
+    out_ray: wp.array(dtype=wp.vec4),
+): ...
+
+
+@wp.kernel(module=RAYS)
+def ray_blocks_kernel(
+    first: int,
+    camera: CameraView,
+    pixel: wp.array(dtype=int),
+    point: wp.array(dtype=wp.vec3),
+    direction: wp.array(dtype=wp.vec3),
+    x0: int,
+    y0: int,
+    box_width: int,
+    out_ray: wp.array(dtype=wp.vec4),
+):
+    """As `raster.ray_image_kernel`, one thread per block of mirror pixels."""
+    ray_block((first + wp.tid()) * BLOCK, camera, pixel, point, direction, x0, y0, box_width, out_ray)

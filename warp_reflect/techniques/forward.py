@@ -345,7 +345,7 @@ def reflect(
         target = raster.make_target(gbuffer.view, pixels.box, scene.device, gbuffer.reflector_id, reflector.id)
         target.view.painter = int(settings.occlusion == "painter")
         if settings.refine != "off":
-            raster.attach_rays(target, gbuffer.view, pixels, settings.threads)
+            raster.attach_rays(target, gbuffer.view, pixels, settings.threads, settings.kernels)
         drawn = raster.rasterise(
             target,
             vertices.screen,

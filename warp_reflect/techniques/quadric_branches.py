@@ -437,7 +437,7 @@ def reflect_branches(
     with timer("virtual_raster"):
         target = raster.make_target(gbuffer.view, pixels.box, scene.device, gbuffer.reflector_id, reflector.id)
         if settings.refine != "off":
-            raster.attach_rays(target, gbuffer.view, pixels, settings.threads)
+            raster.attach_rays(target, gbuffer.view, pixels, settings.threads, settings.kernels)
         drawn = offset = 0
         doubt = np.zeros((target.box[3] - target.box[1] + 1, target.box[2] - target.box[0] + 1), np.int64)
         for k, (mesh, vertices) in enumerate(branches):

@@ -256,7 +256,7 @@ def follow(
     screen = seen_at(found.solved)
     mesh, screen = _cut_where_bent(scene, found, screen, seen_at, layer.pixels.box, settings)
     target = raster.make_target(gbuffer.view, layer.pixels.box, device)
-    raster.attach_rays(target, gbuffer.view, layer.pixels, threads)
+    raster.attach_rays(target, gbuffer.view, layer.pixels, threads, settings.kernels)
     drawn = raster.rasterise(
         target, screen, mesh.triangles, points=mesh.points, threads=threads, kernels=settings.kernels
     )
