@@ -135,6 +135,15 @@ def test_render_of_chosen_channels_and_exact_size(stage, call):
     }
 
 
+def test_channels_are_asked_for_by_the_names_of_others_too(stage, call):
+    code, _, _ = call("render", stage, "a.exr", "--res", "16x8", "--aov", "depth, normal,HdrColor,color,N")
+    assert code == 0
+    assert set(images.read_exr("a.exr")[0]) == {"Z", "N", "R", "G", "B", "A"}
+    code, _, err = call("render", stage, "a.exr", "--aov", "pathLenght")
+    assert code == 2
+    assert "unknown channel 'pathLenght'; nearest: pathLength; known: RGBA, R," in err
+
+
 def test_render_of_frames_numbers_the_files(stage, call):
     code, out, _ = call("render", stage, "a.###.exr", "b.#.##.png", "-f", "1:3x2", "-w", "40")
     assert code == 0
@@ -185,7 +194,7 @@ def test_frame_that_fails_is_named_and_the_others_go_on(stage, call):
         (["render", "stage.usda", "a.exr", "--res", "0x10"], "--res: got '0x10'"),
         (["render", "stage.usda", "a.exr", "-w", "0"], "--imageWidth: got 0"),
         (["render", "stage.usda", "a.exr", "-w", "wide"], "wide"),
-        (["render", "stage.usda", "a.exr", "--aov", "depth"], "reflectedPoint"),
+        (["render", "stage.usda", "a.exr", "--aov", "deep"], "reflectedPoint"),
         (["render", "stage.usda", "a.exr", "--reflector", "/World/None*"], "/World/None*"),
         (["render", "stage.usda", "a.exr", "--purposes", "everything"], "proxy"),
         (["render", "stage.usda", "a.exr", "--complexity", "extreme"], "veryhigh"),

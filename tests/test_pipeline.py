@@ -157,6 +157,8 @@ def test_resume_with_everything_done_renders_nothing(render):
     code, out, err = render("a.#.exr", "-f", "1:3", "--resume")
     assert (code, out, err) == (0, [], ["resume: 3 of 3 frames are done"])
     assert {name: os.stat(name).st_mtime_ns for name in contents()} == before
+    _, _, err = render("a.#.exr", "-f", "1:3", "--resume", "--progress", "json")
+    assert [json.loads(line)["event"] for line in err] == ["line", "begin", "end"]
 
 
 @pytest.mark.parametrize("change", ["setting", "method", "size", "camera", "layer", "threads", "moved"])
@@ -373,6 +375,12 @@ def test_time_limit_begins_no_frame_that_would_not_end(stage, monkeypatch):
     assert [outcome.place for outcome in outcomes] == [0, 1, 2, 3]
 
 
+@pytest.mark.parametrize("seconds", ["-1", "nan"])
+def test_time_limit_that_is_none_is_refused(render, seconds):
+    code, _, err = render("a.#.exr", "-f", "1:3", f"--timelimit={seconds}")
+    assert (code, err) == (2, [f"error: --timelimit: got {seconds}, expected seconds, 0 or more"])
+
+
 def test_time_limit_is_told(render):
     code, out, err = render("a.#.exr", "-f", "1:3", "--timelimit", "0")
     assert (code, out) == (1, [])
@@ -495,6 +503,18 @@ def test_scheduler_that_is_not_there_is_one_line_and_2(render, monkeypatch):
     assert (code, out, len(err)) == (2, [], 1)
     assert err[0].startswith("error: --scheduler tcp://127.0.0.1:9: no answer within 0.5 s")
     assert not contents()
+
+
+@pytest.mark.parametrize("address", ["nonsense", "tcp://host", "tcp://host:port", "foo://host:8786"])
+def test_scheduler_address_that_is_none_is_one_line_and_2(stage, device, address):
+    # In a process of its own: what is complained of at its end counts, too.
+    command = [sys.executable, "-m", "warp_reflect.cli", "render", stage, "a.#.exr", "-f", "1:3", *SMALL]
+    done = subprocess.run(
+        [*command, "--device", device, "--scheduler", address], capture_output=True, text=True, check=False
+    )
+    told = done.stderr.splitlines()
+    assert (done.returncode, done.stdout, len(told)) == (2, "", 1)
+    assert told[0].startswith(f"error: --scheduler: got '{address}', expected an address as tcp://host:8786")
 
 
 def test_missing_dask_is_one_line_that_names_the_extra(render, monkeypatch):

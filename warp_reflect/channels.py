@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import difflib
+
 import warp as wp
 
 from warp_reflect.launch import launch
@@ -30,6 +32,24 @@ CHANNELS = {
     "residual": ("",),
     "status": ("",),
     "method": ("",),
+}
+# What others call our channels: Hydra's and UsdRender's usual names, and those of Omniverse's renderer.
+ALIASES = {
+    "color": "RGBA",
+    "Ci": "RGBA",
+    "beauty": "RGBA",
+    "rgba": "RGBA",
+    "LdrColor": "RGBA",
+    "HdrColor": "RGBA",
+    "a": "A",
+    "alpha": "A",
+    "depth": "Z",
+    "z": "Z",
+    "DepthSD": "Z",
+    "DistanceToImagePlaneSD": "Z",
+    "normal": "N",
+    "normals": "N",
+    "NormalSD": "N",
 }
 POINTS = ("mirrorPoint", "reflectedPoint")  # world points, known relative to the eye
 
@@ -134,6 +154,17 @@ def _full_name(group: str, part: str) -> str:
     return part if group == "RGBA" else group + part
 
 
+def own_name(name: str) -> str:
+    """Our name of a channel that is asked for by ours or by one of `ALIASES`.
+
+    Raises:
+        KeyError: an unknown name; the message lists the known ones, the nearest first.
+    """
+    name = ALIASES.get(name, name)
+    component_of(name)
+    return name
+
+
 def component_of(name: str) -> tuple[str, int | None]:
     """(group, component index or None for the whole group) of a channel name.
 
@@ -146,4 +177,6 @@ def component_of(name: str) -> tuple[str, int | None]:
         for k, part in enumerate(parts):
             if part and name == _full_name(group, part):
                 return group, k
-    raise KeyError(f"unknown channel '{name}'; known: {', '.join(known_names())}")
+    near = difflib.get_close_matches(name, known_names(), n=3)
+    nearest = f"nearest: {', '.join(near)}; " if near else ""
+    raise KeyError(f"unknown channel '{name}'; {nearest}known: {', '.join(known_names())}")

@@ -163,7 +163,7 @@ def render(
         outputs: Files to write, .exr or .png; with --frames their names hold ####.
         output: The same as a positional output.
         frames: Frames such as 101:109x2,120; without it the stage's first.
-        aov: Channels to write to EXR, comma-separated; without it all of them.
+        aov: Channels to write to EXR, comma-separated; without it all of them. Hydra's and Omniverse's names are known, too.
         opened: How the stage is opened.
         planned: What is simulated, and how.
         ranged: How a range of frames is rendered.
@@ -173,6 +173,7 @@ def render(
     with reporting(ranged.progress) as report:
         try:
             part = _part(ranged.part)
+            _check_time_limit(ranged.timelimit)
             if ranged.workers < 1:
                 raise ValueError(f"--workers: got {ranged.workers}, expected 1 or more")
             names, channels, wanted, notes = _as_the_stage_asks(stage, names, aov, opened, planned)
@@ -279,6 +280,11 @@ def _part(text: str | None) -> tuple[int, int]:
     if not (slash and k.strip().isdecimal() and n.strip().isdecimal() and 1 <= int(k) <= int(n)):
         raise ValueError(f"--part: got '{text}', expected K/N such as 3/8, with K from 1 to N")
     return int(k), int(n)
+
+
+def _check_time_limit(seconds: float | None) -> None:
+    if seconds is not None and not seconds >= 0.0:
+        raise ValueError(f"--timelimit: got {seconds:g}, expected seconds, 0 or more")
 
 
 def _print_job(kind, job, names, frames, aov, opened, planned, ranged) -> int:
@@ -418,6 +424,7 @@ def process(
     opened, planned = opened or StageOptions(), planned or PlanOptions()
     if opened.untrusted:
         raise ValueError("--untrusted: a stage is processed by opening it here; render it untrusted instead")
+    _check_time_limit(timelimit)
     _, _, planned, notes = _as_the_stage_asks(stage, [out], "", opened, planned)
     settings = _settings(planned)
     _check_method(planned.method)
@@ -726,14 +733,12 @@ def _settings(planned: PlanOptions):
 
 
 def _channel_names(text: str) -> list[str]:
-    """The channels of --aov, checked before a frame is rendered for them."""
-    from warp_reflect.channels import component_of
+    """The channels of --aov by our names, checked before a frame is rendered for them."""
+    from warp_reflect.channels import own_name
 
-    names = list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
+    names = list(dict.fromkeys(own_name(name.strip()) for name in text.split(",") if name.strip()))
     if not names:
         raise ValueError(f"--aov: got '{text}', expected channels such as RGBA,reflectedPoint")
-    for name in names:
-        component_of(name)
     return names
 
 

@@ -151,6 +151,15 @@ def _client(distributed, job: Job, workers: int, scheduler: str | None) -> Itera
         if name.partition(".")[0] == "distributed":
             logging.getLogger(name).setLevel(logging.CRITICAL)  # what matters of it is told of the frames
     if scheduler is not None:
+        # Of an address that is none dask would leave half a client behind, which complains when it is deleted.
+        try:
+            scheme, place = distributed.comm.addressing.parse_address(scheduler)
+            distributed.comm.registry.get_backend(scheme)
+            distributed.comm.addressing.parse_host_port(place)
+        except ValueError as error:
+            raise ValueError(
+                f"--scheduler: got '{scheduler}', expected an address as tcp://host:8786 ({error})"
+            ) from None
         try:
             client = distributed.Client(scheduler, timeout=SCHEDULER_SECONDS, set_as_default=False)
         except (OSError, ValueError) as error:

@@ -454,6 +454,7 @@ def run(
             report.line(f"resume: {len(kept):,} of {len(kept) + len(places):,} frames are done")
     report.begin(len(places))
     if not places:
+        report.end(DONE)
         return DONE
     on_cluster = scheduler is not None or workers > 1
     opened = [OpenJob(job, places[0])]

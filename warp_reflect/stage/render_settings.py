@@ -11,7 +11,7 @@ from pathlib import Path
 
 from pxr import Sdf, Tf, Usd, UsdRender
 
-from warp_reflect.channels import component_of
+from warp_reflect.channels import own_name
 from warp_reflect.scene import Note
 from warp_reflect.stage.guard import Limits
 from warp_reflect.stage.intake import library_message
@@ -20,24 +20,6 @@ from warp_reflect.stage.read import open_stage, quiet
 METADATA = "renderSettingsPrimPath"
 SCOPE = "/Render"  # where UsdRender keeps such prims; what relative paths are relative to
 WRITTEN = (".exr", ".png")
-# What others call our channels: Hydra's and UsdRender's usual names, and those of Omniverse's renderer.
-ALIASES = {
-    "color": "RGBA",
-    "Ci": "RGBA",
-    "beauty": "RGBA",
-    "rgba": "RGBA",
-    "LdrColor": "RGBA",
-    "HdrColor": "RGBA",
-    "a": "A",
-    "alpha": "A",
-    "depth": "Z",
-    "z": "Z",
-    "DepthSD": "Z",
-    "DistanceToImagePlaneSD": "Z",
-    "normal": "N",
-    "normals": "N",
-    "NormalSD": "N",
-}
 # Attributes that say something a frame here does not follow, with the value at which that makes no difference.
 UNUSED = {
     "pixelAspectRatio": 1.0,
@@ -163,9 +145,7 @@ def _channels(stage: Usd.Stage, target: Sdf.Path, notes: list[Note]) -> list[str
         return []
     for name in (str(var.GetSourceNameAttr().Get() or ""), target.name):
         try:
-            name = ALIASES.get(name, name)
-            component_of(name)
-            return [name]
+            return [own_name(name)]
         except KeyError:
             continue
     notes.append(Note(str(target), f"no channel is called '{var.GetSourceNameAttr().Get() or target.name}'"))
