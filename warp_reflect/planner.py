@@ -609,7 +609,7 @@ def _look(
             kernels.begin(kernels.of_mirrors(settings, scene.device, casting), scene.device)
 
     seen = look(scene, camera, dict(enumerate(mirrors, 1)), settings.threads, settings.kernels, begin_mirrors)
-    return seen.pixels_of(scene, [*mirrors, *panes]), seen
+    return seen.pixels_of(scene, [*mirrors, *panes], settings.threads, settings.kernels), seen
 
 
 def _tried(

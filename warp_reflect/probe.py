@@ -35,12 +35,12 @@ class EyeView:
     parts: dict[int, int]
     ms: dict[str, float]
 
-    def pixels_of(self, scene: Scene, parts: list[int]) -> dict[int, int]:
+    def pixels_of(self, scene: Scene, parts: list[int], threads: int, kernels: str) -> dict[int, int]:
         """Pixels of the picture that show each part."""
         found = {part: self.pixels[number].count for number, part in self.parts.items()}
         others = [part for part in parts if part not in found]
         if others:
-            found |= surface.seen_parts(scene, self.gbuffer, others)
+            found |= surface.seen_parts(scene, self.gbuffer, others, threads, kernels)
         return found
 
 

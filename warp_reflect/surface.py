@@ -404,10 +404,10 @@ def part_pixels(
     return {part: pixels for part, pixels in found.items() if pixels.count}
 
 
-def seen_parts(scene: Scene, gbuffer: GBuffer, parts: Iterable[int]) -> dict[int, int]:
+def seen_parts(scene: Scene, gbuffer: GBuffer, parts: Iterable[int], threads: int, kernels: str) -> dict[int, int]:
     """Number of the pixels at which the eye sees each of some parts."""
     asked = dict(enumerate(parts, 1))
-    found, _ = _pixels_of(scene, gbuffer, asked, 0, "auto")
+    found, _ = _pixels_of(scene, gbuffer, asked, threads, kernels)
     return {part: len(found[id][0]) for id, part in asked.items()}
 
 
