@@ -24,6 +24,7 @@ BEING_WRITTEN = re.compile(r"_p\d+_t\d+$")
 TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3
 ALLOCATOR_VARIABLES = ("MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_", "GLIBC_TUNABLES")
 KEPT_BYTES = 1 << 28  # several frames' arrays at 1920x1080; what is larger goes back to the system
+OLD_MMAP_LIMIT = 1 << 25  # the largest threshold that older C libraries take; they refuse others
 
 
 def open_device(name: str) -> str:
@@ -66,8 +67,8 @@ def _keep_freed_memory() -> None:
         mallopt = ctypes.CDLL(None).mallopt
     except (AttributeError, OSError, TypeError):
         return  # another C library
-    mallopt(MMAP_THRESHOLD, KEPT_BYTES)
-    mallopt(TRIM_THRESHOLD, KEPT_BYTES)
+    if mallopt(MMAP_THRESHOLD, KEPT_BYTES) or mallopt(MMAP_THRESHOLD, OLD_MMAP_LIMIT):
+        mallopt(TRIM_THRESHOLD, KEPT_BYTES)
 
 
 @contextmanager
