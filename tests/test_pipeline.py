@@ -182,6 +182,23 @@ def test_resume_redoes_frames_that_would_look_different(render, change):
     assert names(out) == ([] if change in ("threads", "moved") else ["a.1.exr", "a.2.exr"])
 
 
+@pytest.mark.parametrize("file", ["look.usda", "stage.usda"])
+def test_a_stage_that_changes_under_way_is_told_and_its_frames_are_made_anew(render, monkeypatch, file):
+    tell, text = Report.frame, Path(file).read_text()
+
+    def change(*arguments):
+        Path(file).write_text(text + "\n# another\n")
+        tell(*arguments)
+
+    monkeypatch.setattr(Report, "frame", change)
+    code, out, err = render("a.#.exr", "-f", "1:3")
+    assert (code, len(out)) == (1, 3)
+    assert [line for line in err if "changed while it was rendered" in line and "--resume" in line]
+    monkeypatch.setattr(Report, "frame", tell)
+    assert names(render("a.#.exr", "-f", "1:3", "--resume")[1]) == ["a.1.exr", "a.2.exr", "a.3.exr"]
+    assert render("a.#.exr", "-f", "1:3", "--resume")[0] == 0
+
+
 def test_resumed_and_divided_ranges_are_the_same_bytes(render):
     assert render("a.#.exr", "-f", "1:7")[0] == 0
     whole = contents()

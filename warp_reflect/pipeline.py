@@ -434,7 +434,6 @@ def run(
     Raises:
         ValueError, OSError: the stage, the camera or the outputs cannot be used, or the cluster cannot be reached.
     """
-    from warp_reflect.stage.identity import stage_digest
     from warp_reflect.stage.write import check_place
 
     deadline = None if seconds is None else time.time() + seconds
@@ -444,7 +443,7 @@ def run(
         else:
             images.check_writable(name)
     report.busy(f"reading {job.stage}")
-    digest = stage_digest(job.stage, job.load.get("root", ""), job.load.get("untrusted", False))
+    digest = _digest(job)
     places = list(part_of(len(job.times), part))
     if resume:
         report.busy("looking at what is done")
@@ -479,7 +478,21 @@ def run(
             # Whoever was at them may have finished them since.
             again = render_places(job, taken, digest, opened, True, asked.is_stopped, deadline)
             tell_all(again, job, report, asked, states, debug)
-    return conclude(job, places, states, asked, report)
+    return conclude(job, places, states, asked, report, _has_changed(job, digest))
+
+
+def _digest(job: Job) -> str:
+    from warp_reflect.stage.identity import stage_digest
+
+    return stage_digest(job.stage, job.load.get("root", ""), job.load.get("untrusted", False))
+
+
+def _has_changed(job: Job, digest: str) -> bool:
+    """Whether the stage's files are others than they were, or cannot be read any more."""
+    try:
+        return _digest(job) != digest
+    except (OSError, ValueError):
+        return True
 
 
 def tell_all(source, job: Job, report: Report, asked: Asked, states: dict[int, str], debug: bool) -> None:
@@ -498,17 +511,24 @@ def tell_all(source, job: Job, report: Report, asked: Asked, states: dict[int, s
         asked.lost = one_line(error)
 
 
-def conclude(job: Job, places: list[int], states: dict[int, str], asked: Asked, report: Report) -> int:
-    """Say what is missing and how to go on; returns the exit code."""
+def conclude(
+    job: Job, places: list[int], states: dict[int, str], asked: Asked, report: Report, has_changed: bool
+) -> int:
+    """Say what is missing or out of date and how to go on; returns the exit code."""
     written = [name for place in places if states.get(place) == "written" for name in job.files[place]]
     written = list(dict.fromkeys(written))
     bad = [place for place in places if states.get(place) in ("failed", "taken")]
     left = len(places) - len(states)
-    code = PART_WAY if bad or left else DONE
+    code = PART_WAY if bad or left or (has_changed and written) else DONE
     if bad and len(job.times) == 1 and states.get(0) == "failed":
         code = IMPOSSIBLE
     elif bad and written:
         report.line(f"kept {len(written):,} finished file{'s' if len(written) > 1 else ''}: {_shortened(written)}")
+    if has_changed and written:
+        report.line(
+            f"{job.stage}: its files changed while it was rendered; frames may show what they were: the same command with "
+            "--resume makes those anew"
+        )
     if left:
         why = f"stopped by {asked.signal.name}" if asked.signal else asked.lost or "stopped by the time limit"
         report.line(
