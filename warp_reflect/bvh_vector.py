@@ -15,7 +15,7 @@ from warp_reflect.launch import launch
 from warp_reflect.settings import Status
 from warp_reflect.wide_packets import TRAVERSAL
 
-wp.set_module_options(vector.OPTIONS)
+wp.set_module_options({"enable_backward": False})
 
 BLOCK_SPLIT_MIN = 8  # blocks; what `bvh.TRACE_SPLIT_MIN` rays are
 LEFT, MISSED = 1, 2  # flags of a block: rays are left to the plain kernels, some meet nothing

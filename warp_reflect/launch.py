@@ -210,9 +210,11 @@ def _compilers(flags: str, process: int) -> ThreadPoolExecutor:
     """Threads that compile with the same flags.
 
     Each thread keeps the precompiled header of Warp's own code for its flags, which costs as much as a module or two: so
-    threads are not shared between flags, and with two kinds of flags half of the cores are for either.
+    threads are not shared between flags. Nearly all modules have Warp's own flags; half of the cores are for others. Flags
+    that differ in what `-mllvm` sets would not do: Warp compiles those one after the other.
     """
-    return ThreadPoolExecutor(max(1, thread_count("cpu") // 2), thread_name_prefix="warp_reflect_compile")
+    cores = thread_count("cpu")
+    return ThreadPoolExecutor(max(1, cores // 2 if flags else cores), thread_name_prefix="warp_reflect_compile")
 
 
 def _compile(module: wp.Module, device: wp.Device) -> None:

@@ -32,7 +32,7 @@ from warp_reflect.raster import (
     triangle_plane,
 )
 
-wp.set_module_options(vector.OPTIONS)
+wp.set_module_options({"enable_backward": False})
 
 RAYS = module_part(__name__, "rays")
 BLOCK = wp.constant(vector.BLOCK)

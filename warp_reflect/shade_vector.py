@@ -17,7 +17,7 @@ from warp_reflect.scene import Scene, SceneView
 from warp_reflect.shade import LightView
 from warp_reflect.textures import Look
 
-wp.set_module_options(vector.OPTIONS)
+wp.set_module_options({"enable_backward": False})
 
 
 @wp.func_native(

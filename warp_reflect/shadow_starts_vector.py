@@ -17,8 +17,8 @@ from warp_reflect.layers import CameraView
 from warp_reflect.scene import SHAPE_QUADRIC, Scene, SceneView
 from warp_reflect.shadow_starts import ROWS, Starts, row_vector
 
-wp.set_module_options(vector.OPTIONS)
-FLAT = module_part(__name__, "flat", **vector.OPTIONS)
+wp.set_module_options({"enable_backward": False})
+FLAT = module_part(__name__, "flat")
 
 
 @wp.func_native(

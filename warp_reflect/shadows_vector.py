@@ -27,7 +27,7 @@ from warp_reflect.shadow_neighbours import (
 from warp_reflect.shadow_starts import Starts
 from warp_reflect.wide_packets import TRAVERSAL
 
-wp.set_module_options(vector.OPTIONS)
+wp.set_module_options({"enable_backward": False})
 
 BLOCK_SPLIT_MIN = 8  # blocks; what `bvh.TRACE_SPLIT_MIN` rays are
 # What `send_blocks_kernel` does.

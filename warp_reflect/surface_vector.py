@@ -12,7 +12,7 @@ from warp_reflect.layers import CameraView
 from warp_reflect.scene import SHAPE_PLANE, SHAPE_QUADRIC, SceneView
 from warp_reflect.surface import LEAST_NORMAL, SURE_SLOPE, mirror_pixel
 
-wp.set_module_options(vector.OPTIONS)
+wp.set_module_options({"enable_backward": False})
 
 BLOCK = wp.constant(vector.BLOCK)
 

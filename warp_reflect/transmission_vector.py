@@ -15,7 +15,7 @@ from warp_reflect.shade import ROUGH_ROUGHNESS, SHARP_ROUGHNESS
 from warp_reflect.textures import Look
 from warp_reflect.transmission import OPAQUE, SOLID, InterfaceView, cross_pixel
 
-wp.set_module_options(vector.OPTIONS)
+wp.set_module_options({"enable_backward": False})
 
 BLOCK = wp.constant(vector.BLOCK)
 

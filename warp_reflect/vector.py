@@ -16,10 +16,7 @@ import warp as wp
 
 from warp_reflect.launch import launch
 
-# Of modules of snippets. Warp's own flags inline whatever is smaller than 9000 instructions, which makes plain kernels twice as
-# fast; snippets are as fast without, and compile in 0.5 to 0.6 of the time (`mirror_blocks_kernel` 1.9 s in place of 3.9).
-OPTIONS = {"enable_backward": False, "cpu_compiler_flags": "-march=native"}
-wp.set_module_options(OPTIONS)
+wp.set_module_options({"enable_backward": False})
 
 BLOCK = 64  # elements per task: what one of them leaves over fills the vectors of a second pass
 BLOCK_SPLIT_MIN = 64  # blocks: what `launch.SPLIT_MIN` elements are

@@ -8,7 +8,7 @@ from warp_reflect import vector
 from warp_reflect.layers import CameraView
 from warp_reflect.waves import Wave
 
-wp.set_module_options(vector.OPTIONS)
+wp.set_module_options({"enable_backward": False})
 
 
 @wp.func_native(

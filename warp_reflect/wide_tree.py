@@ -13,7 +13,7 @@ import warp as wp
 from warp_reflect import vector
 from warp_reflect.launch import launch
 
-wp.set_module_options(vector.OPTIONS)
+wp.set_module_options({"enable_backward": False})
 
 WIDTH = 8  # children of a node
 # 4 bytes each, on whole cache lines of 16: the least x of all children, the least y and z, the most x, y and z; the children.

@@ -19,7 +19,7 @@ from warp_reflect.finishes.water import (
 )
 from warp_reflect.layers import CameraView
 
-wp.set_module_options(vector.OPTIONS)
+wp.set_module_options({"enable_backward": False})
 
 # Of a block: which lanes there are, and how they are written.
 _PIXELS = r"""

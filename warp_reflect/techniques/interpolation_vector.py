@@ -15,7 +15,7 @@ from warp_reflect.techniques.lanes import REFLECTOR_MAP, VIRTUAL_VERTEX
 from warp_reflect.techniques.map_search import ACCEPTED, NORMAL_PART_MIN, SPD_SHARE, STEP_CAP
 from warp_reflect.techniques.vertices import ESTIMATE, SolveFrame, VertexView
 
-wp.set_module_options(vector.OPTIONS)
+wp.set_module_options({"enable_backward": False})
 
 
 @wp.func_native(

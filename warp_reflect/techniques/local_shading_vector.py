@@ -18,7 +18,7 @@ from warp_reflect.techniques.local_shading import (
     TEXEL_SKY,
 )
 
-wp.set_module_options(vector.OPTIONS)
+wp.set_module_options({"enable_backward": False})
 
 # Both need: `place`, `r`, `step`, `missing`, `triangle`, `state`.
 ROW = rf"""

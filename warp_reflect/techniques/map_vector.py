@@ -33,7 +33,7 @@ from warp_reflect.techniques.map_search import (
 )
 from warp_reflect.techniques.vertices import ESTIMATE, SolveFrame, VertexView
 
-wp.set_module_options(vector.OPTIONS)
+wp.set_module_options({"enable_backward": False})
 
 BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors together
 

@@ -26,7 +26,7 @@ from warp_reflect.techniques.quadric_search import (
 )
 from warp_reflect.techniques.vertices import ESTIMATE, SolveFrame, VertexView
 
-wp.set_module_options(vector.OPTIONS)
+wp.set_module_options({"enable_backward": False})
 
 
 @wp.func_native(

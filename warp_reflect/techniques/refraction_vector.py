@@ -7,7 +7,7 @@ import warp as wp
 from warp_reflect import vector
 from warp_reflect.layers import CameraView
 
-wp.set_module_options(vector.OPTIONS)
+wp.set_module_options({"enable_backward": False})
 
 
 @wp.func_native(
