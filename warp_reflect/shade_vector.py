@@ -12,6 +12,7 @@ import warp as wp
 from warp_reflect import vector
 from warp_reflect.direct import AreaView
 from warp_reflect.direct_vector import SPHERES
+from warp_reflect.hits_vector import HITS
 from warp_reflect.layers import CameraView, GBuffer, ReflectionLayer
 from warp_reflect.scene import Scene, SceneView
 from warp_reflect.shade import LightView
@@ -23,6 +24,7 @@ wp.set_module_options({"enable_backward": False})
 @wp.func_native(
     vector.snippet(
         SPHERES
+        + HITS
         + r"""
     const float pi = 3.14159265358979f;
     const int count = triangle.shape[0];
@@ -75,61 +77,18 @@ wp.set_module_options({"enable_backward": False})
         V p0, p1, p2;
         corners(records.data, tri, p0, p1, p2);
         const I patch = igather(scene.triangle_patch.data, tri);
-        // One patch for all lanes, or for each its own.
-        const bool alone = !bits(patch != patch[0]);
-        const auto* patches = scene.patches.data;
-        constexpr int patch_words = sizeof(*patches) / 4;
-        const auto of_patch = [&](const int* first) -> I {
-            return alone ? I(first[patch_words * patch[0]]) : igather(first, patch_words * patch);
-        };
-        const I shape = of_patch(&patches->shape), material = of_patch(&patches->material);
-        const int* normal_index = (const int*)scene.normal_index.data;
-        const I first_normal = igather(normal_index, 3 * tri);
-        const I smooth = first_normal >= 0;
-        const I quadric = (shape == 1) & ~smooth;
+        const I shape = of_patch(&patches->shape, patch), material = of_patch(&patches->material, patch);
+        Corners smooth = corners_of(tri);
+        const I quadric = (shape == 1) & ~smooth.smooth;
         const bool colored = scene.color_index.shape[0] > 0 && looks.shape[0] == 0;
         F u = F(0.0f), v = F(0.0f);
-        if (bits(seen & (smooth | quadric)) || colored || areas.shape[0] > 0) weights(p0, p1, p2, u, v);
+        if (bits(seen & (smooth.smooth | quadric)) || colored || areas.shape[0] > 0) weights(p0, p1, p2, u, v);
         const F w = 1.0f - u - v;
 
-        // surface.hit_normal
-        V n = facet_normal(p0, p1, p2);
-        if (bits(seen & smooth)) {
-            const I i0 = ipick(smooth, first_normal, I(0));
-            const I i1 = ipick(smooth, igather(normal_index, 3 * tri + 1), I(0));
-            const I i2 = ipick(smooth, igather(normal_index, 3 * tri + 2), I(0));
-            const float* all = (const float*)scene.normals.data;
-            const V mixed = add(add(times(w, vgather(all, i0)), times(u, vgather(all, i1))), times(v, vgather(all, i2)));
-            const V kept = vpick(dot(mixed, mixed) < 0.01f, V{F(0.0f), F(0.0f), F(1.0f)}, unit(mixed));
-            n = vpick(smooth, kept, n);
-        }
         const V p = add(add(times(w, p0), times(u, p1)), times(v, p2));
-        if (bits(seen & quadric)) {
-            // A patch's fields as floats: its matrix by rows, then the quadric's first two numbers.
-            const float* matrix = &patches->unit_from_scene.data[0][0];
-            const float* quadrics = (const float*)&patches->quadric;
-            V row[3];
-            F shift[3], a, b;
-            if (alone) {
-                const float* from = matrix + patch_words * patch[0];
-                _Pragma("clang loop unroll(full)") for (int k = 0; k < 3; ++k) {
-                    row[k] = V{F(from[4 * k]), F(from[4 * k + 1]), F(from[4 * k + 2])};
-                    shift[k] = F(from[4 * k + 3]);
-                }
-                a = F(quadrics[patch_words * patch[0]]); b = F(quadrics[patch_words * patch[0] + 1]);
-            } else {
-                F first[8], last[8];
-                gather8(matrix, patch_words * patch, first);
-                gather8(matrix, patch_words * patch + 4, last);
-                row[0] = V{first[0], first[1], first[2]}; shift[0] = first[3];
-                row[1] = V{first[4], first[5], first[6]}; shift[1] = first[7];
-                row[2] = V{last[4], last[5], last[6]}; shift[2] = last[7];
-                a = gather(quadrics, patch_words * patch); b = gather(quadrics + 1, patch_words * patch);
-            }
-            const F x = dot(row[0], p) + shift[0], y = dot(row[1], p) + shift[1];
-            const F z = a * (dot(row[2], p) + shift[2]) + 0.5f * b;
-            n = vpick(quadric, unit(add(add(times(x, row[0]), times(y, row[1])), times(z, row[2]))), n);
-        }
+        Quadric of;
+        V q;
+        V n = hit_normal(seen, tri, patch, quadric, facet_normal(p0, p1, p2), p, u, v, smooth, of, q);
         if (normals.shape[0] > 0) {
             const V mapped = vrows((const float*)normals.data, start, full, own);
             n = vpick(dot(mapped, mapped) > 0.0f, mapped, n);
@@ -235,7 +194,6 @@ wp.set_module_options({"enable_backward": False})
         result.mirror = times(opacity, mirror);
         return result;
     };
-    const bool parallel = camera.orthographic != 0;
     float* picture = (float*)out_picture.data;
     float* mirror = (float*)out_mirror.data;
     float* radiance = (float*)out_radiance.data;
@@ -246,40 +204,24 @@ wp.set_module_options({"enable_backward": False})
         const I tri = irow(triangle.data, start, full, own);
         const I seen = tri >= 0;
         I reflector = I(0);
-        V plane, ray, incident;
+        Sight eye;
+        V incident;
         if (of_eye != 0) {
             reflector = irow(reflector_id.data, start, full, own) > 0;
-            const int first_row = start / camera.width;
-            const bool one_row = own[LANES - 1] < (first_row + 1) * camera.width;
-            const I row = one_row ? I(first_row) : own / camera.width;
-            const F x = __builtin_convertvector(own - row * camera.width, F) + 0.5f;
-            const F y = __builtin_convertvector(row, F) + 0.5f;
-            plane = add(add(spread(camera.ray_corner), times(x, spread(camera.ray_dx))), times(y, spread(camera.ray_dy)));
-            ray = parallel ? spread(camera.forward) : plane;
-            incident = unit(ray);
+            F column, line;
+            place(own, camera.width, column, line);
+            eye = sight(column + 0.5f, line + 0.5f);
+            incident = unit(eye.ray);
         } else {
-            plane = ray = incident = vrows((const float*)direction.data, start, full, own);
+            incident = vrows((const float*)direction.data, start, full, own);
         }
         auto weights = [&](V p0, V p1, V p2, F& u, F& v) {
-            if (of_eye == 0) {
-                u = frow(weight_u.data, start, full, own);
-                v = frow(weight_v.data, start, full, own);
+            if (of_eye != 0) {
+                eye_weights(eye, p0, p1, p2, u, v);
                 return;
             }
-            // shade.weights_seen
-            const V eye = spread(camera.eye);
-            V a = sub(p0, eye), b = sub(p1, eye), c = sub(p2, eye);
-            if (parallel) { a = sub(a, plane); b = sub(b, plane); c = sub(c, plane); }
-            const F eu = dot(cross(sub(c, a), add(c, a)), ray);
-            const F ev = dot(cross(sub(a, b), add(a, b)), ray);
-            const F ew = dot(cross(sub(b, c), add(b, c)), ray);
-            const F det = eu + ev + ew;
-            const F inv = 1.0f / det;
-            const F cu = pick(det != 0.0f, fmax(eu * inv, F(0.0f)), F(0.0f));
-            const F cv = pick(det != 0.0f, fmax(ev * inv, F(0.0f)), F(0.0f));
-            const F total = cu + cv;
-            u = pick(total > 1.0f, cu / total, cu);
-            v = pick(total > 1.0f, cv / total, cv);
+            u = frow(weight_u.data, start, full, own);
+            v = frow(weight_v.data, start, full, own);
         };
         Lit shown = Lit{same(0.0f), same(1.0f)};
         V onward = incident;

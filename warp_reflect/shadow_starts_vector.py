@@ -12,6 +12,7 @@ from warp_reflect import vector
 from warp_reflect.bvh import FLOAT_EPS, OFFSET_ULPS
 from warp_reflect.direct import SPHERE, DirectView, Points, area_irradiance
 from warp_reflect.direct_vector import SPHERES
+from warp_reflect.hits_vector import HITS
 from warp_reflect.launch import launch, module_part
 from warp_reflect.layers import CameraView
 from warp_reflect.scene import SHAPE_QUADRIC, Scene, SceneView
@@ -24,44 +25,12 @@ FLAT = module_part(__name__, "flat")
 @wp.func_native(
     vector.snippet(
         SPHERES
+        + HITS
         + r"""
-// A loop over lanes that is kept one: unrolled, it would take long to compile.
-#define LANE_BY_LANE _Pragma("clang loop unroll(disable)") for (int l = 0; l < LANES; ++l)
-    // The quadrics of the patches of some lanes: rows and shifts of `unit_from_scene`, and a, b, c.
-    struct Quadric { V row[3]; F shift[3], a, b, c; };
-    auto quadric_of = [&](I patch, bool alone) -> Quadric {
-        const auto* patches = scene.patches.data;
-        float rows[15 * LANES];
-        LANE_BY_LANE {
-            if (alone && l > 0) break;
-            const auto& each = patches[patch[l]];
-            for (int k = 0; k < 12; ++k) rows[k * LANES + l] = each.unit_from_scene.data[k / 4][k % 4];
-            for (int k = 0; k < 3; ++k) rows[(12 + k) * LANES + l] = each.quadric[k];
-        }
-        auto field = [&](int k) -> F { return alone ? F(rows[k * LANES]) : load(rows + k * LANES); };
-        Quadric of;
-        _Pragma("clang loop unroll(full)") for (int k = 0; k < 3; ++k) {
-            of.row[k] = V{field(4 * k), field(4 * k + 1), field(4 * k + 2)};
-            of.shift[k] = field(4 * k + 3);
-        }
-        of.a = field(12); of.b = field(13); of.c = field(14);
-        return of;
-    };
-    // Point p in the frame of its quadric.
-    auto in_quadric = [&](const Quadric& of, V p) -> V {
-        return V{dot(of.row[0], p) + of.shift[0], dot(of.row[1], p) + of.shift[1], dot(of.row[2], p) + of.shift[2]};
-    };
-    // A vector of the frame of a quadric as one of the scene.
-    auto from_quadric = [&](const Quadric& of, V g) -> V {
-        return add(add(times(g.x, of.row[0]), times(g.y, of.row[1])), times(g.z, of.row[2]));
-    };
     const int count = triangle.shape[0];
     const int begin = block * BLOCK;
     const int end = begin + BLOCK < count ? begin + BLOCK : count;
-    const bool parallel = camera.orthographic != 0;
     const int image_width = of_eye != 0 ? camera.width : width;
-    const V eye = spread(camera.eye);
-    const int* normal_index = (const int*)scene.normal_index.data;
     float* rows = out_rows.data;
     const int stride = out_rows.shape[1];
     const int area_count = lights.areas.shape[0] < out_unshadowed.shape[0] ? lights.areas.shape[0] : out_unshadowed.shape[0];
@@ -89,29 +58,12 @@ FLAT = module_part(__name__, "flat")
         F u, v;
         corners(records.data, tri, p0, p1, p2);
         F column, line;
-        if (image_width > 0) {
-            const I row = number / image_width;
-            column = __builtin_convertvector(number - row * image_width, F);
-            line = __builtin_convertvector(row, F);
-        }
+        if (image_width > 0) place(number, image_width, column, line);
         if (of_eye != 0) {
             // direct.eye_weights_kernel
-            const V plane = add(add(spread(camera.ray_corner), times(column + 0.5f, spread(camera.ray_dx))),
-                times(line + 0.5f, spread(camera.ray_dy)));
-            const V ray = parallel ? spread(camera.forward) : plane;
-            V a = sub(p0, eye), b = sub(p1, eye), c = sub(p2, eye);
-            if (parallel) { a = sub(a, plane); b = sub(b, plane); c = sub(c, plane); }
-            const F eu = dot(cross(sub(c, a), add(c, a)), ray);
-            const F ev = dot(cross(sub(a, b), add(a, b)), ray);
-            const F ew = dot(cross(sub(b, c), add(b, c)), ray);
-            const F det = eu + ev + ew;
-            const F inv = 1.0f / det;
-            const F cu = pick(det != 0.0f, fmax(eu * inv, F(0.0f)), F(0.0f));
-            const F cv = pick(det != 0.0f, fmax(ev * inv, F(0.0f)), F(0.0f));
-            const F total = cu + cv;
-            u = pick(total > 1.0f, cu / total, cu);
-            v = pick(total > 1.0f, cv / total, cv);
-            way = unit(ray);
+            const Sight eye = sight(column + 0.5f, line + 0.5f);
+            eye_weights(eye, p0, p1, p2, u, v);
+            way = unit(eye.ray);
         } else {
             u = gather(weight_u.data, own);
             v = gather(weight_v.data, own);
@@ -121,42 +73,22 @@ FLAT = module_part(__name__, "flat")
         const F w = 1.0f - u - v;
         const V at = add(add(times(w, p0), times(u, p1)), times(v, p2));
         const V facet = facet_normal(p0, p1, p2);
-        V n = facet, p = at;
-        const I first_normal = igather(normal_index, 3 * tri);
-        const I smooth = first_normal >= 0;
         const I patch = igather(scene.triangle_patch.data, tri);
-        const bool alone = !bits(patch != patch[0]);
-        I shape;
-        if (alone) shape = I(scene.patches.data[patch[0]].shape);
-        else EACH_LANE shape[l] = scene.patches.data[patch[l]].shape;
-        const I quadric = (shape == shape_quadric) & ~smooth;
-        V n0 = same(0.0f), n1 = n0, n2 = n0;
-        if (bits(seen & smooth)) {
-            const float* all = (const float*)scene.normals.data;
-            n0 = vgather(all, ipick(smooth, first_normal, I(0)));
-            n1 = vgather(all, ipick(smooth, igather(normal_index, 3 * tri + 1), I(0)));
-            n2 = vgather(all, ipick(smooth, igather(normal_index, 3 * tri + 2), I(0)));
-            const V mixed = add(add(times(w, n0), times(u, n1)), times(v, n2));
-            const V kept = vpick(dot(mixed, mixed) < 0.01f, V{F(0.0f), F(0.0f), F(1.0f)}, unit(mixed));
-            n = vpick(smooth, kept, n);
-        }
+        Corners smooth = corners_of(tri);
+        const I quadric = (of_patch(&patches->shape, patch) == shape_quadric) & ~smooth.smooth;
         Quadric of;
         V q;
-        if (bits(seen & quadric)) {
-            of = quadric_of(patch, alone);
-            q = in_quadric(of, at);
-            n = vpick(quadric, unit(from_quadric(of, V{q.x, q.y, of.a * q.z + 0.5f * of.b})), n);
-        }
+        V n = hit_normal(seen, tri, patch, quadric, facet, at, u, v, smooth, of, q), p = at;
         const F turned = pick(dot(n, way) > 0.0f, F(-1.0f), F(1.0f));
         const V side = times(pick(dot(facet, n) < 0.0f, -turned, turned), facet);
-        if (bits(seen & smooth)) {
+        if (bits(seen & smooth.smooth)) {
             auto above_tangent = [&](V from, V corner, V normal) -> V {
                 return times(fmax(dot(sub(corner, from), normal), F(0.0f)), normal);
             };
-            V raised = add(p, times(w, above_tangent(p, p0, times(turned, n0))));
-            raised = add(raised, times(u, above_tangent(raised, p1, times(turned, n1))));
-            raised = add(raised, times(v, above_tangent(raised, p2, times(turned, n2))));
-            p = vpick(smooth, raised, p);
+            V raised = add(p, times(w, above_tangent(p, p0, times(turned, smooth.n0))));
+            raised = add(raised, times(u, above_tangent(raised, p1, times(turned, smooth.n1))));
+            raised = add(raised, times(v, above_tangent(raised, p2, times(turned, smooth.n2))));
+            p = vpick(smooth.smooth, raised, p);
         }
         if (bits(seen & quadric)) {
             const F f = q.x * q.x + q.y * q.y + (of.a * q.z + of.b) * q.z - of.c;

@@ -1,0 +1,108 @@
+"""Text for the vector kernels that ask what a triangle is at a point: the formulas of `surface.py`, in the same order."""
+
+from __future__ import annotations
+
+# After `vector.snippet`'s head, in functions that have `scene` and `camera`.
+HITS = r"""
+    // Columns and rows of pixels, which mostly lie in one row.
+    auto place = [&](I number, int width, F& column, F& line) {
+        const int first = number[0] / width * width;
+        const I row = !bits((number < first) | (number >= first + width)) ? I(first / width) : number / width;
+        column = __builtin_convertvector(number - row * width, F);
+        line = __builtin_convertvector(row, F);
+    };
+    // The rays of an eye through pixel coordinates: where a parallel eye's start, and directions of any length.
+    struct Sight { V plane, ray; };
+    const bool parallel = camera.orthographic != 0;
+    auto sight = [&](F x, F y) -> Sight {
+        const V plane = add(add(spread(camera.ray_corner), times(x, spread(camera.ray_dx))), times(y, spread(camera.ray_dy)));
+        return Sight{plane, parallel ? spread(camera.forward) : plane};
+    };
+    // shapes.intersect_triangle, whose determinant is returned, and shapes.clamp_weights; 0 where there is no area.
+    auto eye_weights = [&](const Sight& of, V p0, V p1, V p2, F& u, F& v) -> F {
+        const V eye = spread(camera.eye);
+        V a = sub(p0, eye), b = sub(p1, eye), c = sub(p2, eye);
+        if (parallel) { a = sub(a, of.plane); b = sub(b, of.plane); c = sub(c, of.plane); }
+        const F eu = dot(cross(sub(c, a), add(c, a)), of.ray);
+        const F ev = dot(cross(sub(a, b), add(a, b)), of.ray);
+        const F ew = dot(cross(sub(b, c), add(b, c)), of.ray);
+        const F det = eu + ev + ew;
+        const F inv = 1.0f / det;
+        const F cu = pick(det != 0.0f, fmax(eu * inv, F(0.0f)), F(0.0f));
+        const F cv = pick(det != 0.0f, fmax(ev * inv, F(0.0f)), F(0.0f));
+        const F total = cu + cv;
+        u = pick(total > 1.0f, cu / total, cu);
+        v = pick(total > 1.0f, cv / total, cv);
+        return det;
+    };
+    // Integer fields of patches; neighbouring points mostly share one, which is then read once.
+    const auto* patches = scene.patches.data;
+    constexpr int patch_words = sizeof(*patches) / 4;
+    auto of_patch = [&](const int* field, I patch) -> I {
+        return !bits(patch != patch[0]) ? I(field[patch_words * patch[0]]) : igather(field, patch_words * patch);
+    };
+    // Their quadrics: rows and shifts of `unit_from_scene`, and a, b, c.
+    struct Quadric { V row[3]; F shift[3], a, b, c; };
+    auto quadric_of = [&](I patch) -> Quadric {
+        const float* matrix = &patches->unit_from_scene.data[0][0];
+        const float* numbers = (const float*)&patches->quadric;
+        F field[12];
+        const I at = patch_words * patch;
+        const bool alone = !bits(patch != patch[0]);
+        if (alone) {
+            _Pragma("clang loop unroll(full)") for (int k = 0; k < 12; ++k) field[k] = F(matrix[at[0] + k]);
+        } else {
+            F last[8];
+            gather8(matrix, at, field);
+            gather8(matrix, at + 4, last);
+            _Pragma("clang loop unroll(full)") for (int k = 8; k < 12; ++k) field[k] = last[k - 4];
+        }
+        auto number = [&](int k) -> F { return alone ? F(numbers[at[0] + k]) : gather(numbers + k, at); };
+        Quadric of;
+        _Pragma("clang loop unroll(full)") for (int k = 0; k < 3; ++k) {
+            of.row[k] = V{field[4 * k], field[4 * k + 1], field[4 * k + 2]};
+            of.shift[k] = field[4 * k + 3];
+        }
+        of.a = number(0); of.b = number(1); of.c = number(2);
+        return of;
+    };
+    // Point p in the frame of its quadric, and a vector of that frame as one of the scene.
+    auto in_quadric = [&](const Quadric& of, V p) -> V {
+        return V{dot(of.row[0], p) + of.shift[0], dot(of.row[1], p) + of.shift[1], dot(of.row[2], p) + of.shift[2]};
+    };
+    auto from_quadric = [&](const Quadric& of, V g) -> V {
+        return add(add(times(g.x, of.row[0]), times(g.y, of.row[1])), times(g.z, of.row[2]));
+    };
+    // The normals of triangles' corners, where they have any, and theirs in between, of any length.
+    struct Corners { I first, smooth; V n0, n1, n2; };
+    const int* normal_index = (const int*)scene.normal_index.data;
+    auto corners_of = [&](I tri) -> Corners {
+        Corners of;
+        of.first = igather(normal_index, 3 * tri);
+        of.smooth = of.first >= 0;
+        return of;
+    };
+    auto between = [&](Corners& of, I tri, F u, F v) -> V {
+        const float* all = (const float*)scene.normals.data;
+        of.n0 = vgather(all, ipick(of.smooth, of.first, I(0)));
+        of.n1 = vgather(all, ipick(of.smooth, igather(normal_index, 3 * tri + 1), I(0)));
+        of.n2 = vgather(all, ipick(of.smooth, igather(normal_index, 3 * tri + 2), I(0)));
+        return add(add(times(1.0f - u - v, of.n0), times(u, of.n1)), times(v, of.n2));
+    };
+    // surface.hit_normal at points p of lanes `seen`; what its parts were is left in `of` and, in the quadric's frame, `q`.
+    auto hit_normal = [&](I seen, I tri, I patch, I quadric, V facet, V p, F u, F v, Corners& smooth, Quadric& of, V& q) -> V {
+        V n = facet;
+        if (bits(seen & smooth.smooth)) {
+            const V mixed = between(smooth, tri, u, v);
+            const V kept = vpick(dot(mixed, mixed) < 0.01f, V{F(0.0f), F(0.0f), F(1.0f)}, unit(mixed));
+            n = vpick(smooth.smooth, kept, n);
+        }
+        if (bits(seen & quadric)) {
+            of = quadric_of(patch);
+            q = in_quadric(of, p);
+            n = vpick(quadric, unit(from_quadric(of, V{q.x, q.y, of.a * q.z + 0.5f * of.b})), n);
+        }
+        return n;
+    };
+    (void)place; (void)sight; (void)eye_weights; (void)of_patch; (void)hit_normal;
+"""
