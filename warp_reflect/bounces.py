@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 import warp as wp
 
-from warp_reflect import bvh, compact, launch, shade
+from warp_reflect import bvh, compact, launch, ray_walk, shade
 from warp_reflect.counts import add_statistics
 from warp_reflect.layers import GBuffer, MirrorPixels, ReflectionLayer, Reflector, meeting
 from warp_reflect.normal_maps import prepare_normals
@@ -46,17 +46,17 @@ class Mirrors:
 
     @property
     def bodies(self) -> wp.array:
-        """`bvh.OwnBody` of every patch, without triangles where it is no reflector's."""
+        """`ray_walk.OwnBody` of every patch, without triangles where it is no reflector's."""
         return self._scene.kept("bodies of mirrors", self._reflectors, self._bodies)
 
     def _bodies(self) -> wp.array:
         # By columns: to make a structure for each of some thousand patches takes as long as a small picture.
-        scene, bodies = self._scene, np.zeros(len(self.patches), bvh.OwnBody.numpy_dtype())
+        scene, bodies = self._scene, np.zeros(len(self.patches), ray_walk.OwnBody.numpy_dtype())
         for reflector in self._reflectors:
             body, patches = bvh.body_of(scene, reflector.part, reflector.convex), scene.parts[reflector.part].patches
             for name in bodies.dtype.names:
                 bodies[name][list(patches)] = getattr(body, name)
-        return wp.array(bodies, dtype=bvh.OwnBody, device=scene.device)
+        return wp.array(bodies, dtype=ray_walk.OwnBody, device=scene.device)
 
 
 @wp.kernel

@@ -1,4 +1,4 @@
-"""What rays meet first, for a block of them at a time: `bvh.trace_ray` in packets, bit for bit.
+"""What rays meet first, for a block of them at a time: `ray_walk.trace_ray` in packets, bit for bit.
 
 Neighbouring rays stay together for most of the way (`wide_packets.py`). The few rays that meet their own facet or body first
 are left to `bvh`, with what they met.
@@ -10,8 +10,8 @@ import numpy as np
 import warp as wp
 
 from warp_reflect import vector
-from warp_reflect.bvh import OwnBody
 from warp_reflect.launch import launch
+from warp_reflect.ray_walk import OwnBody
 from warp_reflect.settings import Status
 from warp_reflect.wide_packets import TRAVERSAL
 
@@ -158,7 +158,7 @@ _CONSTANTS = f"""
         return vload(both, 0);
 #endif
     };
-    // `bvh.exact_hit`, lanes of `hit`; the weights of the second and third corner in place of Warp's.
+    // `ray_walk.exact_hit`, lanes of `hit`; the weights of the second and third corner in place of Warp's.
     auto finish = [&](I hit, V o, V d, Met& met) {
         V v0, v1, v2;
         corners(records.data, ipick(hit, met.face, I(0)), v0, v1, v2);
@@ -195,7 +195,7 @@ _CONSTANTS = f"""
             own[g] = own_of(g);
             from[g] = rows(points, own[g]);
             along[g] = rows(directions, own[g]);
-            // bvh.ray_offset
+            // ray_walk.ray_offset
             const F offset = 16.0f * 1.1920929e-7f * (__builtin_elementwise_abs(from[g].x)
                 + __builtin_elementwise_abs(from[g].y) + __builtin_elementwise_abs(from[g].z));
             o[g] = add(from[g], times(offset, rows(normals, own[g])));
@@ -221,7 +221,7 @@ _CONSTANTS = f"""
                 }
                 missed[g] &= found[g].face < 0;
                 some |= missed[g];
-                // bvh.moved_direction
+                // ray_walk.moved_direction
                 const F step = 8.0f * 1.1920929e-7f * size(d[g]);
                 d[g] = vpick(missed[g], add(d[g], V{step, -0.625f * step, 0.375f * step}), d[g]);
             }
@@ -250,7 +250,7 @@ _CONSTANTS = f"""
             const I hit = m.face >= 0;
             I over = (m.face >= first) & (m.face < first + length);
             if (inside.shape[0] > 0 && bits(over)) {
-                // bvh.trace_onward
+                // ray_walk.trace_onward
                 V v0, v1, v2;
                 corners(records.data, ipick(hit, m.face, I(0)), v0, v1, v2);
                 const I leaves = dot(facet_normal(v0, v1, v2), d[g]) > 0.0f;
@@ -405,7 +405,7 @@ def first_met(
         rays: vec3 each: points, normals on the rays' side, unit directions.
         start: Where they start: facets; int32, where among these that of each ray is, none: in order; the body of all of
             them; bodies of patches, none: that body; the patches of triangles; uint8, where rays have gone through a
-            surface: 1 where they are in its body (`bvh.trace_onward`), none: they are reflected.
+            surface: 1 where they are in its body (`ray_walk.trace_onward`), none: they are reflected.
         index: int32, which of the rays; None: all.
         numbers: int32, the pixels of rays.
         width: Of their picture, whose tiles stay together where the pixels of the rays asked ascend; 0: there is none.

@@ -9,15 +9,16 @@ from __future__ import annotations
 import warp as wp
 
 from warp_reflect import launch
-from warp_reflect.bvh import FINITE_FLAGS, TRACE_SPLIT_MIN, flush_direction, ray_offset
+from warp_reflect.bvh import TRACE_SPLIT_MIN
 from warp_reflect.cutouts import is_hole
 from warp_reflect.direct import SPHERE, AreaView, DirectView, area_irradiance
 from warp_reflect.holes import HOLES_MAX
+from warp_reflect.ray_walk import flush_direction, ray_offset
 from warp_reflect.scene import SceneView
 from warp_reflect.shadow_starts import RayStart, ray_start, sample_place, sample_shift
 from warp_reflect.shadows import FAR, area_ray, area_shown, sky_ray
 
-wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FINITE_FLAGS})
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": launch.FINITE_FLAGS})
 
 
 @wp.func

@@ -7,7 +7,7 @@ from collections.abc import Collection
 import numpy as np
 import warp as wp
 
-from warp_reflect import bvh, launch
+from warp_reflect import bvh, launch, ray_walk
 from warp_reflect.cutouts import WRAPS, Cutouts, CutView, is_hole, make_cutouts, no_cutouts
 from warp_reflect.layers import CameraView, GBuffer, ReflectionLayer, eye_ray_direction, eye_ray_origin
 from warp_reflect.pictures import (
@@ -119,14 +119,14 @@ def _view(texture: TextureRef, place: tuple[int, int, int], column: int, row: in
 
 
 @wp.func
-def is_hole_hit(scene: SceneView, hit: bvh.RayHit) -> bool:
+def is_hole_hit(scene: SceneView, hit: ray_walk.RayHit) -> bool:
     return is_hole(scene.cuts, hit.triangle, hit.u, hit.v)
 
 
 @wp.func
 def beyond_hole(origin: wp.vec3, direction: wp.vec3, t: float) -> float:
     """Where a ray goes on that has met a hole at t."""
-    return t + bvh.ray_offset(origin) + bvh.ray_offset(origin + t * direction)
+    return t + ray_walk.ray_offset(origin) + ray_walk.ray_offset(origin + t * direction)
 
 
 @wp.kernel
@@ -140,8 +140,8 @@ def go_past_kernel(
     point: wp.array(dtype=wp.vec3),
     normal: wp.array(dtype=wp.vec3),
     direction: wp.array(dtype=wp.vec3),
-    body: bvh.OwnBody,
-    bodies: wp.array(dtype=bvh.OwnBody),
+    body: ray_walk.OwnBody,
+    bodies: wp.array(dtype=ray_walk.OwnBody),
     inside: wp.array(dtype=wp.uint8),
     # Changed:
     out_triangle: wp.array(dtype=int),
@@ -154,7 +154,7 @@ def go_past_kernel(
     i = first + wp.tid()
     if out_triangle[i] < 0:
         return
-    hit = bvh.RayHit()
+    hit = ray_walk.RayHit()
     hit.triangle = out_triangle[i]
     hit.u = out_u[i]
     hit.v = out_v[i]
@@ -173,13 +173,13 @@ def go_past_kernel(
         holes += 1
         t0 = beyond_hole(point[i], direction[i], wp.max(hit.t, t0))
         if inside.shape[0] > 0:
-            hit = bvh.trace_onward(
-                mesh_id, scene, point[i], direction[i], normal[i], facet[start], int(inside[i]), t0, bvh.Met()
+            hit = ray_walk.trace_onward(
+                mesh_id, scene, point[i], direction[i], normal[i], facet[start], int(inside[i]), t0, ray_walk.Met()
             )
         else:
-            hit = bvh.trace_ray(mesh_id, scene, point[i], direction[i], normal[i], facet[start], own, 1, t0)
+            hit = ray_walk.trace_ray(mesh_id, scene, point[i], direction[i], normal[i], facet[start], own, 1, t0)
     if holes == HOLES_MAX:
-        hit = bvh.RayHit()
+        hit = ray_walk.RayHit()
         hit.triangle = -1
         hit.status = STEP_LIMIT
     out_triangle[i] = hit.triangle
@@ -195,7 +195,7 @@ def go_past(
     tracer: bvh.Tracer,
     facet: wp.array,
     pixel: wp.array | None = None,
-    body: bvh.OwnBody | None = None,
+    body: ray_walk.OwnBody | None = None,
     bodies: wp.array | None = None,
     inside: wp.array | None = None,
     threads: int = 0,
@@ -214,11 +214,11 @@ def go_past(
         threads: CPU threads; 0: one per core.
     """
     device, pixels = scene.device, layer.pixels
-    empty = {"pixel": int, "bodies": bvh.OwnBody, "inside": wp.uint8}
+    empty = {"pixel": int, "bodies": ray_walk.OwnBody, "inside": wp.uint8}
     given = {"pixel": pixel, "bodies": bodies, "inside": inside}
     arrays = {k: wp.zeros(0, dtype=empty[k], device=device) if given[k] is None else given[k] for k in empty}
     inputs = [wp.uint64(tracer.id), scene.view, facet, arrays["pixel"], pixels.point, pixels.normal, pixels.direction]
-    inputs += [body or bvh.OwnBody(), arrays["bodies"], arrays["inside"]]
+    inputs += [body or ray_walk.OwnBody(), arrays["bodies"], arrays["inside"]]
     outputs = [layer.triangle, layer.u, layer.v, layer.distance, layer.status]
     launch.launch(go_past_kernel, pixels.count, inputs + outputs, device, threads, split_min=bvh.TRACE_SPLIT_MIN)
 
@@ -256,7 +256,7 @@ def look_past_kernel(
     p = (1.0 - weights[0] - weights[1]) * a + weights[0] * b + weights[1] * c
     nothing = wp.vec3(0.0, 0.0, 0.0)
     start = camera.eye + p
-    hit = bvh.RayHit()
+    hit = ray_walk.RayHit()
     hit.triangle = tri
     hit.u = weights[0]
     hit.v = weights[1]
@@ -265,7 +265,7 @@ def look_past_kernel(
     while hit.triangle >= 0 and is_hole_hit(scene, hit) and holes < HOLES_MAX:
         holes += 1
         t0 = beyond_hole(start, d, wp.max(hit.t, t0))
-        hit = bvh.trace_ray(mesh_id, scene, start, d, nothing, tri, bvh.OwnBody(), 1, t0)
+        hit = ray_walk.trace_ray(mesh_id, scene, start, d, nothing, tri, ray_walk.OwnBody(), 1, t0)
     depth = wp.dot(camera.forward, p + hit.t * d)
     if hit.triangle < 0 or depth > camera.far:
         out_triangle[i] = -1

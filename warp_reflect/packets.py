@@ -10,7 +10,7 @@ from __future__ import annotations
 # After `vector.snippet`'s head.
 RAYS = r"""
     struct Met { I face; F t, u, v; };
-    // bvh.flush_direction
+    // ray_walk.flush_direction
     auto flushed = [&](V d) -> V {
         const F least = 1.0e-12f * size(d);
         auto flush = [&](F a) -> F { return pick(__builtin_elementwise_abs(a) < least, F(0.0f), a); };

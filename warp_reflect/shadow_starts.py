@@ -11,9 +11,9 @@ from __future__ import annotations
 import warp as wp
 
 from warp_reflect import vector
-from warp_reflect.bvh import ray_offset, scene_facet_normal
 from warp_reflect.direct import DirectView, Points, area_irradiance
 from warp_reflect.launch import launch, module_part
+from warp_reflect.ray_walk import ray_offset, scene_facet_normal
 from warp_reflect.scene import SHAPE_QUADRIC, Scene, SceneView
 from warp_reflect.surface import hit_normal, shown_normal
 

@@ -9,12 +9,12 @@ from __future__ import annotations
 import warp as wp
 
 from warp_reflect import vector
-from warp_reflect.bvh import FLOAT_EPS, OFFSET_ULPS
 from warp_reflect.direct import SPHERE, DirectView, Points, area_irradiance
 from warp_reflect.direct_vector import SPHERES
 from warp_reflect.hits_vector import HITS
 from warp_reflect.launch import launch, module_part
 from warp_reflect.layers import CameraView
+from warp_reflect.ray_walk import FLOAT_EPS, OFFSET_ULPS
 from warp_reflect.scene import SHAPE_QUADRIC, Scene, SceneView
 from warp_reflect.shadow_starts import ROWS, Starts, row_vector
 

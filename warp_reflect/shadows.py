@@ -18,7 +18,7 @@ import numpy as np
 import warp as wp
 
 from warp_reflect import launch, vector
-from warp_reflect.bvh import FINITE_FLAGS, TRACE_SPLIT_MIN, flush_direction
+from warp_reflect.bvh import TRACE_SPLIT_MIN
 from warp_reflect.direct import (
     CYLINDER,
     SPHERE,
@@ -28,6 +28,7 @@ from warp_reflect.direct import (
     shown_area,
 )
 from warp_reflect.optics import tangent_basis
+from warp_reflect.ray_walk import flush_direction
 from warp_reflect.scene import Scene
 from warp_reflect.settings import Settings
 from warp_reflect.shadow_neighbours import (
@@ -45,9 +46,11 @@ from warp_reflect.shadow_neighbours import (
 from warp_reflect.shadow_starts import LEAST_SQUARE, RayStart, Starts, row_vector, sample_place, starts_of
 from warp_reflect.shapes import unit
 
-wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FINITE_FLAGS})
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": launch.FINITE_FLAGS})
 # What vector kernels do elsewhere, and what tries lights for a plan.
-PLAIN, TRIED = (launch.module_part(__name__, name, cpu_compiler_flags=FINITE_FLAGS) for name in ("plain", "tried"))
+PLAIN, TRIED = (
+    launch.module_part(__name__, name, cpu_compiler_flags=launch.FINITE_FLAGS) for name in ("plain", "tried")
+)
 
 # Rays towards a shape end this share of the way before it, so that a lamp's own surface, drawn where the light is, does
 # not hide it from without.
