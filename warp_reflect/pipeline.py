@@ -478,7 +478,8 @@ def run(
             # Whoever was at them may have finished them since.
             again = render_places(job, taken, digest, opened, True, asked.is_stopped, deadline)
             tell_all(again, job, report, asked, states, debug)
-    return conclude(job, places, states, asked, report, _has_changed(job, digest))
+    # One frame is over before anybody could change what it reads, and a look at a stage takes as long as a small picture.
+    return conclude(job, places, states, asked, report, len(places) > 1 and _has_changed(job, digest))
 
 
 def _digest(job: Job) -> str:
