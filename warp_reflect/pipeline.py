@@ -443,7 +443,7 @@ def run(
         else:
             images.check_writable(name)
     report.busy(f"reading {job.stage}")
-    digest = _digest(job)
+    digest = digest_of(job)
     places = list(part_of(len(job.times), part))
     if resume:
         report.busy("looking at what is done")
@@ -478,11 +478,11 @@ def run(
             # Whoever was at them may have finished them since.
             again = render_places(job, taken, digest, opened, True, asked.is_stopped, deadline)
             tell_all(again, job, report, asked, states, debug)
-    # One frame is over before anybody could change what it reads, and a look at a stage takes as long as a small picture.
-    return conclude(job, places, states, asked, report, len(places) > 1 and _has_changed(job, digest))
+    return conclude(job, digest, places, states, asked, report)
 
 
-def _digest(job: Job) -> str:
+def digest_of(job: Job) -> str:
+    """`stage_digest` of a job's stage."""
     from warp_reflect.stage.identity import stage_digest
 
     return stage_digest(job.stage, job.load.get("root", ""), job.load.get("untrusted", False))
@@ -491,7 +491,7 @@ def _digest(job: Job) -> str:
 def _has_changed(job: Job, digest: str) -> bool:
     """Whether the stage's files are others than they were, or cannot be read any more."""
     try:
-        return _digest(job) != digest
+        return digest_of(job) != digest
     except (OSError, ValueError):
         return True
 
@@ -512,20 +512,20 @@ def tell_all(source, job: Job, report: Report, asked: Asked, states: dict[int, s
         asked.lost = one_line(error)
 
 
-def conclude(
-    job: Job, places: list[int], states: dict[int, str], asked: Asked, report: Report, has_changed: bool
-) -> int:
+def conclude(job: Job, digest: str, places: list[int], states: dict[int, str], asked: Asked, report: Report) -> int:
     """Say what is missing or out of date and how to go on; returns the exit code."""
     written = [name for place in places if states.get(place) == "written" for name in job.files[place]]
     written = list(dict.fromkeys(written))
     bad = [place for place in places if states.get(place) in ("failed", "taken")]
     left = len(places) - len(states)
-    code = PART_WAY if bad or left or (has_changed and written) else DONE
+    # One frame is over before anybody could change what it reads, and a look at a stage takes as long as a small picture.
+    has_changed = len(places) > 1 and bool(written) and _has_changed(job, digest)
+    code = PART_WAY if bad or left or has_changed else DONE
     if bad and len(job.times) == 1 and states.get(0) == "failed":
         code = IMPOSSIBLE
     elif bad and written:
         report.line(f"kept {len(written):,} finished file{'s' if len(written) > 1 else ''}: {_shortened(written)}")
-    if has_changed and written:
+    if has_changed:
         report.line(
             f"{job.stage}: its files changed while it was rendered; frames may show what they were: the same command with "
             "--resume makes those anew"

@@ -27,6 +27,7 @@ from warp_reflect.pipeline import (
     check_range,
     claimed,
     conclude,
+    digest_of,
     frame_key,
     listening,
     one_line,
@@ -93,7 +94,6 @@ def run(
         ValueError, OSError: the stage, the camera or the outputs cannot be used.
     """
     from warp_reflect.stage import write
-    from warp_reflect.stage.identity import stage_digest
 
     if wish.purpose not in PURPOSES:
         raise ValueError(f"--purpose: got '{wish.purpose}', expected one of {', '.join(PURPOSES)}")
@@ -104,7 +104,7 @@ def run(
         write.check_place(Path(wish.glb))
     deadline = None if seconds is None else time.time() + seconds
     report.busy(f"reading {job.stage}")
-    digest = stage_digest(job.stage, job.load.get("root", ""))
+    digest = digest_of(job)
     provenance = _provenance(job, wish, digest, path)
     layer = VirtualLayer.open(job.stage, path, provenance, wish.purpose, resume)
     places = [place for place, code in enumerate(job.times) if code not in layer.times]
@@ -139,7 +139,7 @@ def run(
             if saver.saved:
                 report.line(f"kept {path} with {saver.saved:,} frame{'s' * (saver.saved != 1)}")
             return PART_WAY if saver.saved or kept else IMPOSSIBLE
-    return conclude(job, places, states, asked, report)
+    return conclude(job, digest, places, states, asked, report)
 
 
 class _Saver:
