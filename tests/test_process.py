@@ -493,6 +493,23 @@ def test_resumed_layer_is_the_same(stage, call):
     assert out.count("parts.usda:") == 3
 
 
+def test_a_stage_that_changes_under_way_is_told(stage, call, monkeypatch):
+    real = process._add_frame
+
+    def change(*arguments):
+        with open(stage, "a") as file:
+            file.write("# another\n")
+        return real(*arguments)
+
+    monkeypatch.setattr(process, "_add_frame", change)
+    code, _, err = call(stage, "changed.usda", "-f", "1:3")
+    assert code == 1
+    assert err.count("changed while it was rendered") == 1
+    monkeypatch.setattr(process, "_add_frame", real)
+    code, out, err = call(stage, "changed.usda", "-f", "1:3", "--resume")
+    assert (code, out.count("changed.usda:")) == (0, 3)
+
+
 def test_stopped_run_keeps_its_frames(stage, call, monkeypatch):
     real = process._add_frame
 
