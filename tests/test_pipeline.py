@@ -545,9 +545,9 @@ def test_cores_of_a_process_are_bounded_by_the_environment(monkeypatch, device):
     if device != "cpu":
         pytest.skip("slices are a matter of the CPU")
     monkeypatch.setattr(launch, "thread_count", lambda *_: 4)
-    assert launch.slice_length(100_000, "cpu") < 50_000
+    assert launch.shared_by(100_000, "cpu") == 4
     monkeypatch.setenv(launch.CORES_VARIABLE, "1")
-    assert launch.slice_length(100_000, "cpu") == 100_000
+    assert launch.shared_by(100_000, "cpu") == 1
 
 
 # What frames share.

@@ -2,7 +2,9 @@
 
 A Warp launch on the CPU is one loop on one thread. `launch` cuts it into slices that run at the same time;
 a kernel therefore takes the first index of its slice as its first argument and works on element
-`first + wp.tid()`. Warp's CPU atomics are plain memory operations: kernels launched here write only to
+`first + wp.tid()`. The threads take slice after slice, large ones first, until none is left: guided self-scheduling
+(Polychronopoulos and Kuck, IEEE Transactions on Computers C-36, 1987), so that none waits long for another whose elements
+cost more, or that begins late. Warp's CPU atomics are plain memory operations: kernels launched here write only to
 elements that belong to their own index (or to their own row band, see raster.py), so that results are
 bit-equal at any number of threads.
 """
@@ -11,15 +13,22 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Iterable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from copy import copy
 from functools import cache, partial
 from time import perf_counter
 
 import warp as wp
 
 SPLIT_MIN = 4096  # elements below which the hand-off (20-60 us) costs more than the second thread saves
+# Of what is left, each thread takes a slice of so much: more would leave no room for elements that cost more than others.
+TAKEN_SHARE = 1 / 2
+# The smallest slices, since one costs 15 us itself: of what is just split, and of each thread's share.
+LEAST_OF_SPLIT = 1 / 4
+LEAST_OF_SHARE = 1 / 8
 # Environment variable: the most threads of a launch where `threads` is 0, for processes that share a machine. It cuts
 # launches, it plans nothing: a frame's plan is the same in all of them.
 CORES_VARIABLE = "WARP_REFLECT_THREADS"
@@ -29,7 +38,7 @@ CPU_BLOCK_DIM = 1  # what Warp launches with on the CPU
 CUDA_BLOCK_DIM = 128
 # A thread's at which three warps fit into each quarter of a multiprocessor: 16,384 are handed out in units of 256 a warp.
 MOST_REGISTERS = 168
-SLICE_ALIGN = 64  # elements; slices that share a cache line of 4-byte results would ping-pong it
+SLICE_ALIGN = 64  # elements; slices that share a cache line of results would ping-pong it
 
 # Warp's own default (the option replaces it) and one flag: without NaN the box test's min and max are single
 # instructions, which makes a query 1.5 to 1.8 times as fast. Warp's headers name NAN: no warnings about that.
@@ -101,19 +110,39 @@ def thread_count(device, threads: int = 0) -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def slice_length(count: int, device, threads: int = 0, split_min: int = SPLIT_MIN) -> int:
-    """Elements of every slice but the last of a launch over `count` elements (all of them where it is not split)."""
+def shared_by(count: int, device, threads: int = 0, split_min: int = SPLIT_MIN) -> int:
+    """Threads that a launch over `count` elements is shared by: 1 where it is not split."""
     parts = thread_count(device, threads)
     allowed = os.environ.get(CORES_VARIABLE, "") if threads == 0 else ""
     if allowed.isdecimal() and int(allowed) > 0:
         parts = min(parts, int(allowed))
-    if parts == 1 or count < split_min:
-        return count
-    step = -(-count // parts)
-    return -(-step // SLICE_ALIGN) * SLICE_ALIGN
+    return 1 if count < split_min else parts
 
 
-def launch(kernel, count: int, inputs: list, device, threads: int = 0, split_min: int = SPLIT_MIN) -> None:
+def slices(count: int, parts: int, split_min: int = SPLIT_MIN, align: int = 0) -> list[tuple[int, int]]:
+    """(first element, length) of a launch's slices: ever smaller ones.
+
+    Args:
+        count: Elements in all.
+        parts: Threads.
+        split_min: See `launch`: it tells what an element costs.
+        align: Elements that stay together; 0: as many as share a cache line, if elements are that cheap.
+    """
+    cheap = max(int(split_min * LEAST_OF_SPLIT), 1)
+    align = align or min(SLICE_ALIGN, cheap)
+    least = max(int(count * LEAST_OF_SHARE / parts), cheap)
+    made, first = [], 0
+    while first < count:
+        length = max(int((count - first) * TAKEN_SHARE / parts), least)
+        length = min(-(-length // align) * align, count - first)
+        made.append((first, length))
+        first += length
+    return made
+
+
+def launch(
+    kernel, count: int, inputs: list, device, threads: int = 0, split_min: int = SPLIT_MIN, align: int = 0
+) -> None:
     """Run `kernel` for elements 0..count-1 and return when its outputs may be read by the next launch.
 
     Args:
@@ -123,21 +152,40 @@ def launch(kernel, count: int, inputs: list, device, threads: int = 0, split_min
         device: Warp device.
         threads: CPU threads; 0: one per core. Ignored on CUDA.
         split_min: Smallest count that is split over threads.
+        align: Elements of runs that one thread works on, if a kernel writes to what belongs to a run; 0: any.
     """
     if count <= 0:
         return
     _record(kernel, count)
     _load(kernel, device)
-    step = slice_length(count, device, threads, split_min)
-    if step >= count:
+    parts = shared_by(count, device, threads, split_min)
+    if parts == 1:
         wp.launch(kernel, dim=count, inputs=[0, *inputs], device=device, **_blocks(device))
         return
-    run_parallel(
-        [
-            partial(wp.launch, kernel, dim=min(step, count - first), inputs=[first, *inputs], device=device)
-            for first in range(0, count, step)
-        ]
-    )
+    # The arguments are checked and packed once; each thread has its own copy of them, but for the slice.
+    packed = wp.launch(kernel, dim=count, inputs=[0, *inputs], device=device, record_cmd=True)
+    left = deque(slices(count, parts, split_min, align))
+    run_parallel([partial(_take_slices, packed, left)] * min(parts, len(left)))
+
+
+def _take_slices(packed: wp.Launch, left: deque[tuple[int, int]]) -> None:
+    """Run slices until none is left to be taken."""
+    own = _own(packed)
+    while left:
+        try:
+            first, length = left.popleft()
+        except IndexError:  # another thread was faster
+            return
+        own.set_dim(length)
+        own.set_param_at_index(0, first)
+        own.launch()
+
+
+def _own(packed: wp.Launch) -> wp.Launch:
+    """A launch with the same arguments, some of which may be set."""
+    own = copy(packed)
+    own.params = list(packed.params)
+    return own
 
 
 def few_registers(kernel: wp.Kernel) -> wp.Kernel:
@@ -150,17 +198,22 @@ def _blocks(device) -> dict[str, int]:
     return {"block_dim": CUDA_BLOCK_DIM} if wp.get_device(device).is_cuda else {}
 
 
-def launch_bands(kernel, ranges: list[tuple[int, int]], bands: list[tuple[int, int]], inputs: list, device) -> None:
-    """Run `kernel` over every (first, length) range once per band, the bands at the same time.
+def launch_bands(kernel, count: int, bands: list[tuple[int, int]], inputs: list, device) -> None:
+    """On a CPU, run `kernel` for elements 0..count-1 once per band, the bands at the same time.
 
     The kernel's last two arguments are the rows [row_first, row_end) of its band; it writes nothing outside them.
     """
-    _record(kernel, sum(length for _, length in ranges))
+    if count <= 0 or not bands:
+        return
+    _record(kernel, count)
     _load(kernel, device)
+    packed = wp.launch(kernel, dim=count, inputs=[0, *inputs, *bands[0]], device=device, record_cmd=True)
 
     def draw(band: tuple[int, int]) -> None:
-        for first, length in ranges:
-            wp.launch(kernel, dim=length, inputs=[first, *inputs, *band], device=device, **_blocks(device))
+        own = _own(packed)
+        for k, row in enumerate(band, len(inputs) + 1):
+            own.set_param_at_index(k, row)
+        own.launch()
 
     run_parallel([partial(draw, band) for band in bands])
 
@@ -225,7 +278,7 @@ def _compile(module: wp.Module, device: wp.Device) -> None:
         module.load(device, CPU_BLOCK_DIM)
 
 
-def run_parallel(jobs: list) -> None:
+def run_parallel(jobs: list[Callable[[], None]]) -> None:
     """Run the callables at the same time, the first on the calling thread; re-raise the first failure."""
     if not jobs:
         return

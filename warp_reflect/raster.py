@@ -4,7 +4,7 @@ Coverage is decided in integers: pixel coordinates are rounded to 1/256 pixel an
 sums, with the top-left rule, so that triangles that share an edge own each pixel centre exactly once. Depth is a key
 that is linear on the screen and grows towards the eye (`layers.project`); ties go to the lower triangle id, so a
 picture does not depend on the order of drawing. Two phases: `cull_kernel` keeps the triangles that cover a pixel centre
-of the target (each CPU slice compacts its own), `draw_kernel` draws the survivors, each CPU thread its own band of rows.
+of the target (on the CPU run by run), `draw_kernel` draws the survivors, each CPU thread its own band of rows.
 
 Source of the fixed-point rule: Direct3D 11.3 functional specification, section 3.4 (coordinate snapping and the
 top-left rule); 8 sub-pixel bits as there.
@@ -19,7 +19,7 @@ import numpy as np
 import warp as wp
 
 from warp_reflect import vector
-from warp_reflect.launch import launch, launch_bands, module_part, slice_length, stays
+from warp_reflect.launch import launch, launch_bands, module_part, shared_by, stays
 from warp_reflect.layers import Camera, CameraView, GBuffer, MirrorPixels, project
 from warp_reflect.scene import Scene
 from warp_reflect.shapes import unit
@@ -37,6 +37,7 @@ RAY_ALONG_MIN = wp.constant(0.02)  # sine between a ray and a plane below which 
 RAY_TRUST = wp.constant(0.25)
 DROPPED = wp.constant(-1.0)  # depth key of a vertex that has no picture
 TILE_SIDE = 8  # pixels: the most rows of a tile of the vector kernel
+CULL_RUNS = 4  # of triangles, for each thread: what one thread must not share
 CLIP_VERTICES = 9  # a triangle against five planes has at most eight corners
 
 _polygon = wp.types.matrix(shape=(CLIP_VERTICES, 4), dtype=wp.float32)
@@ -348,7 +349,7 @@ def cull_kernel(
     out_survivor_count: wp.array(dtype=int),
     out_nearest: wp.array(dtype=float),
 ):
-    """One thread per triangle; each slice of `step` triangles compacts its survivors at its own start.
+    """One thread per triangle; each run of `step` triangles compacts its survivors at its own start.
 
     Beside each stands the depth key of its nearest corner, infinite where the eye's own plane cuts it; length 0: not asked for.
     """
@@ -560,55 +561,51 @@ def rasterise(
     count, device = len(triangles), target.key.device
     if count == 0 or len(target.key) == 0:
         return wp.zeros(1, dtype=int, device=device)
-    step = slice_length(count, device, threads)
-    slice_count = -(-count // step)
+    parts = shared_by(count, device, threads)
+    step = count if parts == 1 else -(-count // (parts * CULL_RUNS * vector.BLOCK)) * vector.BLOCK
     vectors = vector.chosen(kernels, device)
     hides = vectors and target.view.ray.shape[0] == 0  # rays tell the depth late: nothing is known to lie behind
     survivors = wp.empty(count, dtype=int, device=device)
-    survivor_count = wp.zeros(slice_count, dtype=int, device=device)
+    survivor_count = wp.zeros(-(-count // step), dtype=int, device=device)
     nearest = wp.empty(count if hides else 0, dtype=float, device=device)
     inputs = [target.view, screen, triangles, step, survivors, survivor_count, nearest]
-    launch(cull_kernel, count, inputs, device, threads)
+    launch(cull_kernel, count, inputs, device, threads, align=step)
     if ids is None:
         ids = wp.empty(0, dtype=int, device=device)
     if points is None:
         points = wp.empty(0, dtype=wp.vec3, device=device)
-    drawn, drawn_count = survivors, survivor_count
-    if not stays(device):
-        ranges = [(k * step, int(n)) for k, n in enumerate(survivor_count.numpy()) if n > 0]
-        if hides and ranges:
-            drawn = nearest_first(survivors, nearest, ranges)
-            step = len(drawn)
-            ranges, drawn_count = [(0, step)], wp.array([step], dtype=int, device=device)
-    inputs = [target.view, screen, triangles, ids, id_offset, step, drawn, drawn_count]
-    inputs += [points, triangles if plane_triangles is None else plane_triangles]
+    named = [triangles, ids, id_offset]
+    planes = [points, triangles if plane_triangles is None else plane_triangles]
     if stays(device):
-        launch_bands(draw_kernel, [(0, count)], [(target.box[1], target.box[3])], inputs, device)
+        inputs = [target.view, screen, *named, step, survivors, survivor_count, *planes, target.box[1], target.box[3]]
+        launch(draw_kernel, count, inputs, device)
         return survivor_count
+    runs = [slice(k * step, k * step + int(n)) for k, n in enumerate(survivor_count.numpy())]
+    drawn = np.concatenate([survivors.numpy()[run] for run in runs])
+    if hides:
+        drawn = nearest_first(drawn, np.concatenate([nearest.numpy()[run] for run in runs]))
+    step = tasks = len(drawn)
+    drawn, drawn_count = (wp.array(numbers, dtype=int, device=device) for numbers in (drawn, [step]))
+    inputs = [target.view, screen, *named, step, drawn, drawn_count, *planes]
     kernel = draw_kernel
     if vectors:
         from warp_reflect import raster_vector  # which draws with this module's functions
 
-        kernel = raster_vector.draw_blocks_kernel
-        # Every slice but the last, which is the only one where there is one, is a multiple of the block.
-        ranges = [(begin // vector.BLOCK, vector.block_count(n)) for begin, n in ranges]
+        kernel, tasks = raster_vector.draw_blocks_kernel, vector.block_count(step)
         inputs.append(wp.zeros(raster_vector.tile_words(target.box) if hides else 0, dtype=wp.uint64, device=device))
-    launch_bands(kernel, ranges, row_bands(target.box[1], target.box[3], slice_count), inputs, device)
+    launch_bands(kernel, tasks, row_bands(target.box[1], target.box[3], parts), inputs, device)
     return survivor_count
 
 
-def nearest_first(survivors: wp.array, nearest: wp.array, ranges: list[tuple[int, int]]) -> wp.array:
-    """Survivors of a culling on the CPU, the blocks with the nearest corners first: what lies behind need not be drawn.
+def nearest_first(survivors: np.ndarray, nearest: np.ndarray) -> np.ndarray:
+    """Survivors of a culling, the blocks with the nearest corners first: what lies behind need not be drawn.
 
     Blocks stay together: neighbours in a mesh find each other's corners and pixels in the caches.
     """
-    parts = [slice(begin, begin + count) for begin, count in ranges]
-    numbers = np.concatenate([survivors.numpy()[part] for part in parts])
-    keys = np.concatenate([nearest.numpy()[part] for part in parts])
-    whole = len(numbers) // vector.BLOCK * vector.BLOCK
-    order = np.argsort(-keys[:whole].reshape(-1, vector.BLOCK).max(axis=1), kind="stable")
-    blocks = numbers[:whole].reshape(-1, vector.BLOCK)[order].ravel()
-    return wp.array(np.concatenate([blocks, numbers[whole:]]), dtype=int, device="cpu")
+    whole = len(survivors) // vector.BLOCK * vector.BLOCK
+    order = np.argsort(-nearest[:whole].reshape(-1, vector.BLOCK).max(axis=1), kind="stable")
+    blocks = survivors[:whole].reshape(-1, vector.BLOCK)[order].ravel()
+    return np.concatenate([blocks, survivors[whole:]])
 
 
 def row_bands(first: int, end: int, count: int) -> list[tuple[int, int]]:
