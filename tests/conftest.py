@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import importlib
 import os
+import sys
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -72,6 +73,7 @@ ARCHITECTURES = (75, 80, 86, 89, 90, 100, 120)  # compute capabilities times ten
 MANY = 200  # tests, or a bounds-checked run: kernels are compiled ahead, on the core that most tests leave idle
 LAUNCHLESS = ("test_house.py",)  # files whose tests launch no kernel
 CHECKED_MIN = 0.9  # share of the package's kernels that a bounds-checked run launches, or it proves little
+WORKERS_MAX = 8  # processes of a whole run: each holds Warp, the kernels and its file's scenes, 1.5 GB at most
 LAUNCHED = pytest.StashKey[list]()
 CHECKED = pytest.StashKey[str]()
 
@@ -101,6 +103,24 @@ def pytest_configure(config: pytest.Config) -> None:
         wp.config.log_level = wp.LOG_WARNING
     else:
         wp.config.quiet = True
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_cmdline_main(config: pytest.Config) -> None:
+    """Where all tests are asked for, and pytest-xdist is installed: on all cores, a file's tests in one process.
+
+    Most tests keep one core busy. What is asked for by name, or in another way than by default, runs in this process.
+    """
+    option = config.option
+    named = config.args_source is pytest.Config.ArgsSource.ARGS or option.keyword or option.markexpr != "not gl"
+    single = (
+        option.warp_debug or option.usepdb or option.collectonly or option.device != "cpu" or sys.platform == "win32"
+    )
+    told = getattr(option, "numprocesses", None) is not None or getattr(option, "tx", None)
+    if not config.pluginmanager.hasplugin("xdist") or hasattr(config, "workerinput") or named or single or told:
+        return
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    option.numprocesses, option.dist = min(cores, WORKERS_MAX), "loadfile"
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -163,22 +183,48 @@ def device(request: pytest.FixtureRequest) -> str:
     return name
 
 
+def _worker(config: pytest.Config) -> tuple[int, int]:
+    """This process's number among those of pytest-xdist, and how many they are."""
+    told = getattr(config, "workerinput", None)
+    return (int(told["workerid"].removeprefix("gw")), told["workercount"]) if told else (0, 1)
+
+
+def _compile_once(locks: Path) -> None:
+    """Of several processes one compiles a kernel module; the others wait for it, and find it in Warp's cache."""
+    import fcntl
+
+    compile_module = launch._compile
+
+    def compile_alone(module: wp.Module, device: wp.Device) -> None:
+        with open(locks / f"{module.name}.lock", "w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            compile_module(module, device)
+
+    launch._compile = compile_alone
+
+
 @pytest.fixture(scope="session", autouse=True)
-def compiled_ahead(request: pytest.FixtureRequest) -> None:
+def compiled_ahead(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> None:
     """What tests will need is on its way to be compiled: for CUDA what they ask for, for the CPU all, where most are run."""
     config = request.config
-    if any("compiled_for_cuda" in getattr(item, "fixturenames", ()) for item in request.session.items):
+    worker, workers = _worker(config)
+    if workers > 1:
+        _compile_once(tmp_path_factory.getbasetemp().parent)
+    elif any("compiled_for_cuda" in getattr(item, "fixturenames", ()) for item in request.session.items):
         request.getfixturevalue("compiled_for_cuda")
     launching = [item for item in request.session.items if item.path.name not in LAUNCHLESS]
     if config.getoption("--device") == "cpu" and (len(launching) > MANY or LAUNCHED in config.stash):
         wp.init()
-        for name in warmup.kernel_modules():
+        for name in list(warmup.kernel_modules())[worker::workers]:
             launch.ready(kernels.modules_of(name), wp.get_device("cpu"))
 
 
 @pytest.fixture(scope="session")
 def compiled_for_cuda(request: pytest.FixtureRequest):
-    """Gives the PTX of a kernel module, texts by architecture; what tests will ask for is compiled beside the others."""
+    """Gives the PTX of a kernel module, texts by architecture; what tests will ask for is compiled beside the others.
+
+    Among several processes, which leave no core idle, it is compiled where it is asked for.
+    """
     every = request.config.getoption("--all-architectures")
     architectures = ARCHITECTURES if every else (ARCHITECTURES[0], ARCHITECTURES[-1])
 
@@ -193,6 +239,9 @@ def compiled_for_cuda(request: pytest.FixtureRequest):
                 texts.setdefault(architecture, []).extend(found)
         return texts
 
+    if _worker(request.config)[1] > 1:
+        yield compiled
+        return
     asked = [item for item in request.session.items if "compiled_for_cuda" in getattr(item, "fixturenames", ())]
     names = [item.callspec.params["module"] for item in asked]
     with ThreadPoolExecutor(1) as pool:
