@@ -131,11 +131,23 @@ def test_what_is_left_out_behind_others_is_hidden_by_them(seed):
 
 
 def test_bands_of_rows_have_whole_tiles():
+    rng = np.random.default_rng(3)
     for first, end, count in ((0, 720, 2), (3, 94, 5), (0, 5, 8), (2, 9, 2)):
-        bands = raster.row_bands(first, end, count)
-        assert bands[0][0] == first and bands[-1][1] == end
-        assert all(a[1] == b[0] for a, b in itertools.pairwise(bands))
-        assert all((begin - first) % 8 == 0 and begin < stop for begin, stop in bands)
+        rows = rng.uniform(first - 50, end + 50, 200).astype(np.float32)
+        rows[:4] = np.nan, np.inf, -np.inf, 1e30
+        for some in (rows, rows[:4], rows[:0]):
+            bands = raster.balanced_bands((7, first, 60, end), some, count)
+            assert bands[0][0] == first and bands[-1][1] == end and len(bands) <= count
+            assert all(a[1] == b[0] for a, b in itertools.pairwise(bands))
+            assert all((begin - first) % 8 == 0 and begin < stop for begin, stop in bands)
+
+
+def test_bands_of_rows_are_narrow_where_triangles_are_many():
+    even = raster.balanced_bands((0, 0, 1280, 720), np.zeros(0), 2)
+    assert even == [(0, 352), (352, 720)]
+    rows = np.full(1000, 600.0)  # one of BALANCED_BY each
+    (_, middle), _ = raster.balanced_bands((0, 0, 1280, 720), rows, 2)
+    assert 592 <= middle <= 600
 
 
 def rays_of(rng, count):

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import warp as wp
@@ -37,6 +38,8 @@ RAY_ALONG_MIN = wp.constant(0.02)  # sine between a ray and a plane below which 
 RAY_TRUST = wp.constant(0.25)
 DROPPED = wp.constant(-1.0)  # depth key of a vertex that has no picture
 TILE_SIDE = 8  # pixels: the most rows of a tile of the vector kernel
+BALANCED_BY = 64  # every such triangle is looked at for where bands of rows end
+PIXELS_PER_TRIANGLE = 350  # pixels that are drawn in the time of a small triangle
 CULL_RUNS = 4  # of triangles, for each thread: what one thread must not share
 CLIP_VERTICES = 9  # a triangle against five planes has at most eight corners
 
@@ -593,7 +596,11 @@ def rasterise(
 
         kernel, tasks = raster_vector.draw_blocks_kernel, vector.block_count(step)
         inputs.append(wp.zeros(raster_vector.tile_words(target.box) if hides else 0, dtype=wp.uint64, device=device))
-    launch_bands(kernel, tasks, row_bands(target.box[1], target.box[3], parts), inputs, device)
+    bands = [(target.box[1], target.box[3])]
+    if parts > 1 and tasks:
+        some = triangles.numpy()[drawn.numpy()[::BALANCED_BY], 0]
+        bands = balanced_bands(target.box, screen.numpy()[some, 1], parts)
+    launch_bands(kernel, tasks, bands, inputs, device)
     return survivor_count
 
 
@@ -608,12 +615,24 @@ def nearest_first(survivors: np.ndarray, nearest: np.ndarray) -> np.ndarray:
     return np.concatenate([blocks, survivors[whole:]])
 
 
-def row_bands(first: int, end: int, count: int) -> list[tuple[int, int]]:
-    """Rows [first, end) in at most `count` contiguous, non-empty bands; each but the last has whole tiles."""
-    edges = np.linspace(0, end - first, max(count, 1) + 1).astype(int)
-    edges[1:-1] -= edges[1:-1] % TILE_SIDE
-    edges = np.unique(first + edges)
-    return list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
+def balanced_bands(box: tuple[int, int, int, int], rows: np.ndarray, count: int) -> list[tuple[int, int]]:
+    """A box's rows in at most `count` bands that take as long as each other; each but the last has whole tiles.
+
+    Args:
+        box: (x0, y0, x1, y1), half open.
+        rows: In which row a corner is, of every `BALANCED_BY`th triangle.
+        count: Bands.
+    """
+    x0, first, x1, end = box
+    height = end - first
+    row = np.fmax(np.fmin(rows, end - 1), first).astype(int) - first  # of what is no number the first
+    cost = BALANCED_BY * np.bincount(row, minlength=height) + (x1 - x0) / PIXELS_PER_TRIANGLE
+    spent = np.cumsum(cost)
+    edges = [
+        int(row) // TILE_SIDE * TILE_SIDE for row in np.searchsorted(spent, spent[-1] / count * np.arange(1, count))
+    ]
+    edges = [first + row for row in (0, *edges, height)]
+    return [(start, stop) for start, stop in pairwise(edges) if stop > start]
 
 
 def kept_triangles(scene: Scene, without: Collection[int]) -> list[tuple[int, int]]:
