@@ -177,11 +177,12 @@ def onward(
             break
         looks = prepare_looks(scene, gbuffer, layer, threads)
         normals = prepare_normals(scene, gbuffer, layer, threads)
-        point, normal, direction, carried, domes = (wp.zeros(n, dtype=wp.vec3, device=device) for _ in range(5))
+        point, normal, direction, domes = (wp.empty(n, dtype=wp.vec3, device=device) for _ in range(4))
+        carried = wp.zeros(n, dtype=wp.vec3, device=device)  # of what is too dark nothing is written
         inputs = [scene.view, scene.lights, looks, normals, layer.triangle, layer.u, layer.v]
         inputs += [layer.pixels.direction, weight, asked]
         inputs += [point, normal, direction, carried, domes]
-        launch.launch(reflect_hits_kernel, n, inputs, device, threads)
+        launch.launch(reflect_hits_kernel, n, inputs, device, threads, split_min=bvh.TRACE_SPLIT_MIN)
         going = compact.positive(carried)
         if not len(going):
             break
@@ -199,7 +200,8 @@ def onward(
         index, weight = asked if index is None else compact.taken(index, asked), carried
         facet, pixel = (compact.taken(array, asked) for array in (layer.triangle, layer.pixels.pixel))
         pixels = MirrorPixels(layer.pixels.reflector, pixel, point, normal, direction, layer.pixels.box)
-        layer = ReflectionLayer.empty(pixels, Technique.RAYTRACED, device)
+        make = ReflectionLayer.unset if forward is None or depth else ReflectionLayer.empty
+        layer = make(pixels, Technique.RAYTRACED, device)
         if forward is not None and depth == 0:
             forward(layer, facet)
             _trace_others(scene, layer, facet, mirrors.bodies, threads, kernels, width)
@@ -220,7 +222,7 @@ def _trace_others(
     pixels = layer.pixels
     arrays = pixels.pixel, pixels.point, pixels.normal, pixels.direction, facet
     some = [compact.taken(array, others) for array in arrays]
-    rest = ReflectionLayer.empty(MirrorPixels(pixels.reflector, *some[:4], pixels.box), layer.method, scene.device)
+    rest = ReflectionLayer.unset(MirrorPixels(pixels.reflector, *some[:4], pixels.box), layer.method, scene.device)
     bvh.trace_bounced(scene, rest, some[4], bodies, threads, kernels, width)
     for name in ("triangle", "u", "v", "distance", "status"):
         compact.put(getattr(layer, name), others, getattr(rest, name))

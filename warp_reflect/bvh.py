@@ -10,7 +10,7 @@ import copy
 import numpy as np
 import warp as wp
 
-from warp_reflect import launch, vector
+from warp_reflect import compact, launch, vector
 from warp_reflect.launch import FINITE_FLAGS
 from warp_reflect.layers import GBuffer, MirrorPixels, ReflectionLayer
 from warp_reflect.ray_walk import (
@@ -393,7 +393,7 @@ def trace_pixels(
         some = _with_status(layer, index, Status.SKY) if known else rays[8:]
         # The neighbours' answers are read from a copy, so that the order of threads cannot matter.
         inputs = [*rays[:8], *some, wp.clone(layer.status), *outputs]
-        launch.launch(retry_pixels_kernel, len(some[0]), inputs, scene.device, threads)
+        launch.launch(retry_pixels_kernel, len(some[0]), inputs, scene.device, threads, split_min=TRACE_SPLIT_MIN)
     if scene.has_hole is not None:
         _past_holes(
             scene, layer, scene.mirror_tracer(part), gbuffer.triangle, pixels.pixel, body=rays[7], threads=threads
@@ -405,11 +405,11 @@ def _with_status(layer: ReflectionLayer, index: wp.array | None, status: Status)
     """Which of the rays asked have a status: int32, and 1."""
     found = layer.status.numpy()
     if index is None:
-        some = np.flatnonzero(found == status)
+        some = np.flatnonzero(found == np.uint8(status))
     else:
         asked = index.numpy()
-        some = asked[found[asked] == status]
-    return [wp.array(some, dtype=int, device=layer.status.device), 1]
+        some = asked[found[asked] == np.uint8(status)]
+    return [compact.listed(some, layer.status.device), 1]
 
 
 def _first_met(

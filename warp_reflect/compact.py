@@ -18,6 +18,11 @@ wp.set_module_options({"enable_backward": False})
 RUN = wp.constant(32)  # values that a thread looks at: four launches for a large picture
 
 
+def listed(numbers: np.ndarray, device) -> wp.array:
+    """NumPy's whole numbers as int32; nobody writes to them: on the CPU int32 is not copied."""
+    return wp.array(numbers.astype(np.int32, copy=False), dtype=int, device=device, copy=False)
+
+
 @wp.kernel
 def is_marked_kernel(first: int, marks: wp.array(dtype=wp.uint8), value: int, out_one: wp.array(dtype=int)):
     """One thread per element: 1 or 0."""
@@ -49,7 +54,7 @@ def _listed(marks: wp.array, value: int) -> tuple[wp.array, wp.array]:
 def marked(marks: wp.array, value: int) -> wp.array:
     """Ascending numbers of the elements of a uint8 array that have a value, int32."""
     if not stays(marks.device):
-        return wp.array(np.flatnonzero(marks.numpy() == value).astype(np.int32), dtype=int, device=marks.device)
+        return listed(np.flatnonzero(marks.numpy() == np.uint8(value)), marks.device)
     if not len(marks):
         return wp.empty(0, dtype=int, device=marks.device)
     numbers, ends = _listed(marks, value)
@@ -80,8 +85,7 @@ def positive(values: wp.array) -> wp.array:
     """Ascending numbers of the elements of a vec3 array, none of whose numbers is below 0, that are not 0, int32."""
     if not stays(values.device):
         x, y, z = values.numpy().T
-        numbers = np.flatnonzero(x + y + z > 0.0).astype(np.int32)
-        return wp.array(numbers, dtype=int, device=values.device)
+        return listed(np.flatnonzero(x + y + z > 0.0), values.device)
     marks = wp.empty(len(values), dtype=wp.uint8, device=values.device)
     launch(positive_kernel, len(values), [values, marks], values.device)
     return marked(marks, 1)
@@ -135,7 +139,7 @@ def every_kernel(first: int, out_number: wp.array(dtype=int)):
 def every(count: int, device) -> wp.array:
     """The numbers from 0 on, int32."""
     if not stays(device):
-        return wp.array(np.arange(count, dtype=np.int32), dtype=int, device=device)
+        return listed(np.arange(count, dtype=np.int32), device)
     numbers = wp.empty(count, dtype=int, device=device)
     launch(every_kernel, count, [numbers], device)
     return numbers
@@ -143,6 +147,10 @@ def every(count: int, device) -> wp.array:
 
 def taken(array: wp.array, numbers: wp.array) -> wp.array:
     """The elements of an array with some numbers, in their order."""
+    if not stays(array.device):
+        # NumPy does it without a launch.
+        elements = array.numpy().take(numbers.numpy(), axis=0)
+        return wp.array(elements, dtype=array.dtype, device=array.device, copy=False)
     return wp.indexedarray(array, [numbers]).contiguous()
 
 
@@ -161,4 +169,7 @@ def joined(arrays: Sequence[wp.array]) -> wp.array:
 
 def put(array: wp.array, numbers: wp.array, values: wp.array) -> None:
     """Write elements of an array, each at most once."""
+    if not stays(array.device):
+        array.numpy()[numbers.numpy()] = values.numpy()
+        return
     wp.copy(wp.indexedarray(array, [numbers]), values)

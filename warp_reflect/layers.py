@@ -294,7 +294,15 @@ class ReflectionLayer:
     radiance: wp.array | None = None
 
     @classmethod
+    def unset(cls, pixels: MirrorPixels, method: int, device) -> ReflectionLayer:
+        """For who answers every pixel: nothing is filled in."""
+        kinds = {"triangle": int, "u": float, "v": float, "distance": float, "status": wp.uint8}
+        room = {name: wp.empty(pixels.count, dtype=kind, device=device) for name, kind in kinds.items()}
+        return cls(pixels=pixels, method=int(method), **room)
+
+    @classmethod
     def empty(cls, pixels: MirrorPixels, method: int, device) -> ReflectionLayer:
+        """For who answers some of the pixels."""
         n = pixels.count
         return cls(
             pixels=pixels,
@@ -334,5 +342,4 @@ def meeting(scene: Scene, layer: ReflectionLayer, patches: np.ndarray) -> wp.arr
         return compact.padded(met, 1)[0]
     triangle = layer.triangle.numpy()
     met = scene.host_triangle_patch.take(triangle, mode="clip")
-    numbers = np.flatnonzero(patches.take(met) & (triangle >= 0)).astype(np.int32)
-    return wp.array(numbers, dtype=int, device=scene.device)
+    return compact.listed(np.flatnonzero(patches.take(met) & (triangle >= 0)), scene.device)

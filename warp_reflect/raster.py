@@ -20,6 +20,7 @@ import numpy as np
 import warp as wp
 
 from warp_reflect import vector
+from warp_reflect.compact import listed
 from warp_reflect.launch import launch, launch_bands, module_part, shared_by, stays
 from warp_reflect.layers import Camera, CameraView, GBuffer, MirrorPixels, project
 from warp_reflect.scene import Scene
@@ -588,7 +589,7 @@ def rasterise(
     if hides:
         drawn = nearest_first(drawn, np.concatenate([nearest.numpy()[run] for run in runs]))
     step = tasks = len(drawn)
-    drawn, drawn_count = (wp.array(numbers, dtype=int, device=device) for numbers in (drawn, [step]))
+    drawn, drawn_count = (listed(numbers, device) for numbers in (drawn, np.array([step], np.int32)))
     inputs = [target.view, screen, *named, step, drawn, drawn_count, *planes]
     kernel = draw_kernel
     if vectors:

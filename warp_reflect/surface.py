@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterable, Mapping
 import numpy as np
 import warp as wp
 
-from warp_reflect import launch, vector
+from warp_reflect import compact, launch, vector
 from warp_reflect.layers import (
     NO_REFLECTOR,
     CameraView,
@@ -330,7 +330,7 @@ def _pixels_of(
     if launch.stays(scene.device):
         return _sorted_by_id(ids, parts, width), ids
     found = _pixels_by_id(ids.numpy(), parts)
-    numbers = {id: wp.array(pixel, dtype=int, device=scene.device) for id, pixel in found.items()}
+    numbers = {id: compact.listed(pixel, scene.device) for id, pixel in found.items()}
     return {id: (numbers[id], pixel_bounds(pixel, width)) for id, pixel in found.items()}, ids
 
 

@@ -43,7 +43,7 @@ def reflect(
     Returns:
         A layer with status CONVERGED, SKY or STEP_LIMIT; statistics `bvh`: rays traced.
     """
-    layer = ReflectionLayer.empty(pixels, Technique.RAYTRACED, scene.device)
+    layer = ReflectionLayer.unset(pixels, Technique.RAYTRACED, scene.device)
     layer.statistics["bvh"] = bvh.trace_pixels(
         scene,
         gbuffer,
