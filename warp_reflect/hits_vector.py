@@ -31,8 +31,12 @@ HITS = r"""
         const F cu = pick(det != 0.0f, fmax(eu * inv, F(0.0f)), F(0.0f));
         const F cv = pick(det != 0.0f, fmax(ev * inv, F(0.0f)), F(0.0f));
         const F total = cu + cv;
-        u = pick(total > 1.0f, cu / total, cu);
-        v = pick(total > 1.0f, cv / total, cv);
+        u = cu;
+        v = cv;
+        if (bits(total > 1.0f)) {
+            u = pick(total > 1.0f, cu / total, cu);
+            v = pick(total > 1.0f, cv / total, cv);
+        }
         return det;
     };
     // Integer fields of patches; neighbouring points mostly share one, which is then read once.
@@ -84,14 +88,24 @@ HITS = r"""
     };
     auto between = [&](Corners& of, I tri, F u, F v) -> V {
         const float* all = (const float*)scene.normals.data;
+        if (!bits(tri != tri[0]) && of.first[0] >= 0) {
+            const int* index = normal_index + 3 * tri[0];
+            of.n0 = spread(all + 3 * index[0]);
+            of.n1 = spread(all + 3 * index[1]);
+            of.n2 = spread(all + 3 * index[2]);
+            return add(add(times(1.0f - u - v, of.n0), times(u, of.n1)), times(v, of.n2));
+        }
         of.n0 = vgather(all, ipick(of.smooth, of.first, I(0)));
         of.n1 = vgather(all, ipick(of.smooth, igather(normal_index, 3 * tri + 1), I(0)));
         of.n2 = vgather(all, ipick(of.smooth, igather(normal_index, 3 * tri + 2), I(0)));
         return add(add(times(1.0f - u - v, of.n0), times(u, of.n1)), times(v, of.n2));
     };
     // surface.hit_normal at points p of lanes `seen`; what its parts were is left in `of` and, in the quadric's frame, `q`.
-    auto hit_normal = [&](I seen, I tri, I patch, I quadric, V facet, V p, F u, F v, Corners& smooth, Quadric& of, V& q) -> V {
-        V n = facet;
+    // `facet` gives the triangles' own, and is asked only where they matter.
+    auto hit_normal = [&](I seen, I tri, I patch, I quadric, const auto& facet, V p, F u, F v, Corners& smooth, Quadric& of,
+                          V& q) -> V {
+        V n = same(0.0f);
+        if (bits(seen & ~smooth.smooth & ~quadric)) n = facet();
         if (bits(seen & smooth.smooth)) {
             const V mixed = between(smooth, tri, u, v);
             const V kept = vpick(dot(mixed, mixed) < 0.01f, V{F(0.0f), F(0.0f), F(1.0f)}, unit(mixed));

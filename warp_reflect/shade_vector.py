@@ -69,178 +69,190 @@ wp.set_module_options({"enable_backward": False})
         }
         return radiance;
     };
-    struct Lit { V base, mirror; };
-    // What lanes `seen` of points `own`, from `start` on, on triangles `tri` give back along unit rays: base radiance and
-    // weight of the mirror term, whose direction is left in `onward`. `weights` gives u and v, and is asked only where they
-    // matter.
-    auto lit = [&](I seen, int start, bool full, I own, I tri, V ray, I reflector, const auto& weights, V& onward) -> Lit {
-        V p0, p1, p2;
-        corners(records.data, tri, p0, p1, p2);
-        const I patch = igather(scene.triangle_patch.data, tri);
-        const I shape = of_patch(&patches->shape, patch), material = of_patch(&patches->material, patch);
-        Corners smooth = corners_of(tri);
-        const I quadric = (shape == 1) & ~smooth.smooth;
-        const bool colored = scene.color_index.shape[0] > 0 && looks.shape[0] == 0;
-        F u = F(0.0f), v = F(0.0f);
-        if (bits(seen & (smooth.smooth | quadric)) || colored || areas.shape[0] > 0) weights(p0, p1, p2, u, v);
-        const F w = 1.0f - u - v;
-
-        const V p = add(add(times(w, p0), times(u, p1)), times(v, p2));
-        Quadric of;
-        V q;
-        V n = hit_normal(seen, tri, patch, quadric, facet_normal(p0, p1, p2), p, u, v, smooth, of, q);
-        if (normals.shape[0] > 0) {
-            const V mapped = vrows((const float*)normals.data, start, full, own);
-            n = vpick(dot(mapped, mapped) > 0.0f, mapped, n);
-        }
-        const F along = dot(n, ray);
-        onward = sub(ray, times(2.0f * along, n));
-        n = vpick(along > 0.0f, times(F(-1.0f), n), n);
-        const F cosine = __builtin_elementwise_abs(along);
-
-        // textures.plain_look, or what was looked up before.
-        const bool looked_up = looks.shape[0] > 0;
-        const auto* materials = scene.materials.data;
-        constexpr int look_words = sizeof(*looks.data) / 4, material_words = sizeof(*materials) / 4;
-        static_assert(look_words == 18, "a look is what is read here");
-        const float* table = looked_up ? (const float*)looks.data : (const float*)materials;
-        const I at = looked_up ? look_words * own : material_words * material;
-        F field[18];
-        if (!bits(at != at[0])) {
-            _Pragma("clang loop unroll(full)") for (int k = 0; k < 18; ++k) field[k] = F(table[at[0] + k]);
-        } else {
-            F last[8];
-            gather8(table, at, field);
-            gather8(table, at + 8, field + 8);
-            gather8(table, at + 10, last);
-            field[16] = last[6]; field[17] = last[7];
-        }
-        V base_color = V{field[0], field[1], field[2]};
-        V f0 = V{field[3], field[4], field[5]}, f90 = V{field[6], field[7], field[8]};
-        const V emissive = V{field[9], field[10], field[11]};
-        const F roughness = field[12], clearcoat = field[13], clearcoat_roughness = field[14], clearcoat_f0 = field[15];
-        const F opacity = field[16], through = field[17];
-        if (colored) {
-            const int* color_index = (const int*)scene.color_index.data;
-            const I first_color = igather(color_index, 3 * tri);
-            const I has = (first_color >= 0) & (igather(&materials->uses_vertex_color, at) != 0);
-            if (bits(seen & has)) {
-                const float* all = (const float*)scene.colors.data;
-                const V c0 = vgather(all, ipick(has, first_color, I(0)));
-                const V c1 = vgather(all, ipick(has, igather(color_index, 3 * tri + 1), I(0)));
-                const V c2 = vgather(all, ipick(has, igather(color_index, 3 * tri + 2), I(0)));
-                const V mixed = add(add(times(w, c0), times(u, c1)), times(v, c2));
-                base_color = vpick(has, mixed, base_color);
-                const F metallic = gather(&materials->metallic, at);
-                const I metal = has & (metallic > 0.0f);
-                const V tint = times(metallic, mixed);
-                f0 = vpick(metal, add(grey((1.0f - metallic) * clearcoat_f0), tint), f0);
-                f90 = vpick(metal, add(grey(1.0f - metallic), tint), f90);
-            }
-        }
-
-        // shade.irradiance_at
-        V total;
-        {
-            const F slope = (2.0f * pi / 3.0f) * dot(spread(lights.sky_slope), n);
-            total = add(times(F(pi), spread(lights.sky)), grey(slope));
-            if (lights.domes.shape[0] > 0) {
-                V e = add(spread(lights.e_1), times(n.x, spread(lights.e_x)));
-                e = add(e, times(n.y, spread(lights.e_y)));
-                e = add(e, times(n.z, spread(lights.e_z)));
-                V x = add(times(n.x, spread(lights.e_xx)), times(n.y, spread(lights.e_xy)));
-                e = add(e, times(n.x, add(x, times(n.z, spread(lights.e_xz)))));
-                e = add(e, times(n.y, add(times(n.y, spread(lights.e_yy)), times(n.z, spread(lights.e_yz)))));
-                e = add(e, times(n.z * n.z, spread(lights.e_zz)));
-                total = add(total, V{fmax(e.x, F(0.0f)), fmax(e.y, F(0.0f)), fmax(e.z, F(0.0f))});
-            }
-            if (sky.shape[0] > 0) total = times(frow(sky.data, start, full, own), total);
-            if (direct.shape[0] > 0) {
-                total = add(total, vrows((const float*)direct.data, start, full, own));
-            } else {
-                for (int k = 0; k < lights.direct.distant.shape[0]; ++k) {
-                    const auto& light = lights.direct.distant.data[k];
-                    total = add(total, times(fmax(dot(n, spread(light.to_light)), F(0.0f)), spread(light.irradiance)));
-                }
-                for (int k = 0; k < areas.shape[0]; ++k) {
-                    const auto& area = areas.data[k];
-                    total = add(total, times(sphere_irradiance(seen, area, p, n), spread(area.radiance)));
-                }
-            }
-        }
-
-        // shade.split_lobes
-        auto sharp_share = [&](F rough) -> F {
-            return pick(reflector, F(1.0f), clip((rough_roughness - rough) / (rough_roughness - sharp_roughness), 0.0f, 1.0f));
-        };
-        auto schlick = [&](V at_0, V at_90) -> V {
-            const F m = 1.0f - clip(cosine, 0.0f, 1.0f);
-            const F m2 = m * m;
-            return add(at_0, times(m2 * m2 * m, sub(at_90, at_0)));
-        };
-        const F sharp = sharp_share(roughness);
-        V mirror = vpick(sharp > 0.0f, times(sharp, schlick(f0, f90)), same(0.0f));
-        const V blurred = times(1.0f - sharp, f0);
-        V albedo = add(blurred, times(1.0f - through, product(sub(sub(f90, mirror), blurred), base_color)));
-        if (bits(seen & (clearcoat > 0.0f))) {
-            const F coat = clearcoat * schlick(grey(clearcoat_f0), same(1.0f)).x;
-            const F sharp_coat = coat * sharp_share(clearcoat_roughness);
-            const I coated = clearcoat > 0.0f;
-            albedo = vpick(coated, add(times(1.0f - coat, albedo), grey(coat - sharp_coat)), albedo);
-            mirror = vpick(coated, add(times(1.0f - coat, mirror), grey(sharp_coat)), mirror);
-        }
-        Lit result;
-        result.base = times(opacity, add(emissive, product(albedo, times(F(1.0f / pi), total))));
-        result.mirror = times(opacity, mirror);
-        return result;
-    };
+    const bool looked_up = looks.shape[0] > 0;
+    const auto* materials = scene.materials.data;
+    constexpr int look_words = sizeof(*looks.data) / 4, material_words = sizeof(*materials) / 4;
+    static_assert(look_words == 18, "a look is what is read here");
+    const float* table = looked_up ? (const float*)looks.data : (const float*)materials;
+    const int* color_index = (const int*)scene.color_index.data;
+    const bool colored = scene.color_index.shape[0] > 0 && !looked_up;
     float* picture = (float*)out_picture.data;
-    float* mirror = (float*)out_mirror.data;
+    float* mirrors = (float*)out_mirror.data;
     float* radiance = (float*)out_radiance.data;
     for (int start = begin; start < end; start += LANES) {
         const I element = start + lanes();
         const I own = ipick(element < end, element, I(end - 1));
         const bool full = start + LANES <= end;
-        const I tri = irow(triangle.data, start, full, own);
-        const I seen = tri >= 0;
+        const I named = irow(triangle.data, start, full, own);
+        const I seen = named >= 0;
+        const I tri = ipick(seen, named, I(0));
         I reflector = I(0);
-        Sight eye;
-        V incident;
-        if (of_eye != 0) {
-            reflector = irow(reflector_id.data, start, full, own) > 0;
-            F column, line;
-            place(own, camera.width, column, line);
-            eye = sight(column + 0.5f, line + 0.5f);
-            incident = unit(eye.ray);
-        } else {
-            incident = vrows((const float*)direction.data, start, full, own);
-        }
-        auto weights = [&](V p0, V p1, V p2, F& u, F& v) {
-            if (of_eye != 0) {
-                eye_weights(eye, p0, p1, p2, u, v);
-                return;
-            }
-            u = frow(weight_u.data, start, full, own);
-            v = frow(weight_v.data, start, full, own);
-        };
-        Lit shown = Lit{same(0.0f), same(1.0f)};
-        V onward = incident;
+        if (of_eye != 0) reflector = irow(reflector_id.data, start, full, own) > 0;
+
+        // textures.plain_look without the mesh's colours, or what was looked up before.
+        I patch = I(0), at = I(0), has_color = I(0), even = I(0), bare = I(0);
+        V base_color, f0, f90, emissive;
+        F roughness, clearcoat = F(0.0f), clearcoat_roughness, clearcoat_f0, opacity, through;
         if (bits(seen)) {
-            V reflected;
-            const Lit found = lit(seen, start, full, own, ipick(seen, tri, I(0)), incident, reflector, weights, reflected);
-            shown = Lit{vpick(seen, found.base, shown.base), vpick(seen, found.mirror, shown.mirror)};
-            onward = vpick(seen, reflected, onward);
+            patch = igather(scene.triangle_patch.data, tri);
+            at = looked_up ? look_words * own : material_words * of_patch(&patches->material, patch);
+            const bool alone = !bits(at != at[0]);
+            F field[18];
+            if (alone) {
+                _Pragma("clang loop unroll(full)") for (int k = 0; k < 18; ++k) field[k] = F(table[at[0] + k]);
+            } else {
+                F last[8];
+                gather8(table, at, field);
+                gather8(table, at + 8, field + 8);
+                gather8(table, at + 10, last);
+                field[16] = last[6]; field[17] = last[7];
+            }
+            base_color = V{field[0], field[1], field[2]};
+            f0 = V{field[3], field[4], field[5]};
+            f90 = V{field[6], field[7], field[8]};
+            emissive = V{field[9], field[10], field[11]};
+            roughness = field[12]; clearcoat = field[13]; clearcoat_roughness = field[14]; clearcoat_f0 = field[15];
+            opacity = field[16]; through = field[17];
+            if (colored) {
+                const int* uses = &materials->uses_vertex_color;
+                has_color = alone ? I(uses[at[0]]) != 0 : igather(uses, at) != 0;
+                if (bits(seen & has_color)) has_color &= igather(color_index, 3 * tri) >= 0;
+            }
+            // What mirrors as much at any angle, and gives back nothing besides.
+            even = (f0.x == f90.x) & (f0.y == f90.y) & (f0.z == f90.z) & ~has_color;
+            bare = seen & reflector & even & ~(clearcoat > 0.0f);
         }
-        const I dome = ~reflector & (size(shown.mirror) > 0.0f);
-        V base = shown.base;
-        if (bits(dome)) base = vpick(dome, add(base, product(shown.mirror, dome_radiance(dome, onward))), base);
-        const V weight = vpick(reflector, shown.mirror, same(0.0f));
+
+        V base = same(0.0f), mirror = same(1.0f);
+        if (bits(bare) == bits(I(-1))) {
+            base = times(opacity, emissive);
+            mirror = times(opacity, f0);
+        } else {
+            Sight eye;
+            V ray;
+            if (of_eye != 0) {
+                F column, line;
+                place(own, camera.width, column, line);
+                eye = sight(column + 0.5f, line + 0.5f);
+                ray = eye.ray;
+            } else {
+                ray = vrows((const float*)direction.data, start, full, own);
+            }
+            V onward;
+            if (bits(seen)) {
+                // shade.sharp_share
+                auto sharp_share = [&](F rough) -> F {
+                    const F share = clip((rough_roughness - rough) / (rough_roughness - sharp_roughness), 0.0f, 1.0f);
+                    return pick(reflector, F(1.0f), share);
+                };
+                const F sharp = sharp_share(roughness);
+                const I coated = seen & (clearcoat > 0.0f), sharply = seen & (sharp > 0.0f);
+                // Where it matters under which angle a surface is seen, and where a ray goes on.
+                const I glancing = ~seen | coated | (sharply & ~(even & reflector));
+
+                V p0, p1, p2;
+                corners(records.data, tri, p0, p1, p2);
+                const I shape = of_patch(&patches->shape, patch);
+                Corners smooth = corners_of(tri);
+                const I quadric = (shape == 1) & ~smooth.smooth;
+                F u = F(0.0f), v = F(0.0f);
+                V p = same(0.0f);
+                if (bits(seen & (smooth.smooth | quadric | has_color)) || areas.shape[0] > 0) {
+                    if (of_eye != 0) {
+                        eye_weights(eye, p0, p1, p2, u, v);
+                    } else {
+                        u = frow(weight_u.data, start, full, own);
+                        v = frow(weight_v.data, start, full, own);
+                    }
+                    p = add(add(times(1.0f - u - v, p0), times(u, p1)), times(v, p2));
+                }
+                if (bits(seen & has_color)) {
+                    const float* all = (const float*)scene.colors.data;
+                    const V c0 = vgather(all, ipick(has_color, igather(color_index, 3 * tri), I(0)));
+                    const V c1 = vgather(all, ipick(has_color, igather(color_index, 3 * tri + 1), I(0)));
+                    const V c2 = vgather(all, ipick(has_color, igather(color_index, 3 * tri + 2), I(0)));
+                    const V mixed = add(add(times(1.0f - u - v, c0), times(u, c1)), times(v, c2));
+                    base_color = vpick(has_color, mixed, base_color);
+                    const F metallic = gather(&materials->metallic, at);
+                    const I metal = has_color & (metallic > 0.0f);
+                    const V tint = times(metallic, mixed);
+                    f0 = vpick(metal, add(grey((1.0f - metallic) * clearcoat_f0), tint), f0);
+                    f90 = vpick(metal, add(grey(1.0f - metallic), tint), f90);
+                }
+
+                Quadric of;
+                V q;
+                auto facet = [&]() -> V { return facet_normal(p0, p1, p2); };
+                V n = hit_normal(seen, tri, patch, quadric, facet, p, u, v, smooth, of, q);
+                if (normals.shape[0] > 0) {
+                    const V mapped = vrows((const float*)normals.data, start, full, own);
+                    n = vpick(dot(mapped, mapped) > 0.0f, mapped, n);
+                }
+                n = vpick(dot(n, ray) > 0.0f, times(F(-1.0f), n), n);
+                F grazing = F(0.0f);  // what is left of Schlick's power of the cosine
+                if (bits(glancing)) {
+                    if (of_eye != 0) ray = unit(ray);
+                    const F along = dot(n, ray);
+                    onward = vpick(seen, sub(ray, times(2.0f * along, n)), ray);
+                    const F m = 1.0f - clip(__builtin_elementwise_abs(along), 0.0f, 1.0f);
+                    const F m2 = m * m;
+                    grazing = m2 * m2 * m;
+                }
+
+                // shade.irradiance_at
+                const F slope = (2.0f * pi / 3.0f) * dot(spread(lights.sky_slope), n);
+                V total = add(times(F(pi), spread(lights.sky)), grey(slope));
+                if (lights.domes.shape[0] > 0) {
+                    V e = add(spread(lights.e_1), times(n.x, spread(lights.e_x)));
+                    e = add(e, times(n.y, spread(lights.e_y)));
+                    e = add(e, times(n.z, spread(lights.e_z)));
+                    V x = add(times(n.x, spread(lights.e_xx)), times(n.y, spread(lights.e_xy)));
+                    e = add(e, times(n.x, add(x, times(n.z, spread(lights.e_xz)))));
+                    e = add(e, times(n.y, add(times(n.y, spread(lights.e_yy)), times(n.z, spread(lights.e_yz)))));
+                    e = add(e, times(n.z * n.z, spread(lights.e_zz)));
+                    total = add(total, V{fmax(e.x, F(0.0f)), fmax(e.y, F(0.0f)), fmax(e.z, F(0.0f))});
+                }
+                if (sky.shape[0] > 0) total = times(frow(sky.data, start, full, own), total);
+                if (direct.shape[0] > 0) {
+                    total = add(total, vrows((const float*)direct.data, start, full, own));
+                } else {
+                    for (int k = 0; k < lights.direct.distant.shape[0]; ++k) {
+                        const auto& light = lights.direct.distant.data[k];
+                        total = add(total, times(fmax(dot(n, spread(light.to_light)), F(0.0f)), spread(light.irradiance)));
+                    }
+                    for (int k = 0; k < areas.shape[0]; ++k) {
+                        const auto& area = areas.data[k];
+                        total = add(total, times(sphere_irradiance(seen, area, p, n), spread(area.radiance)));
+                    }
+                }
+
+                // shade.split_lobes
+                auto schlick = [&](V at_0, V at_90) -> V { return add(at_0, times(grazing, sub(at_90, at_0))); };
+                V gleam = same(0.0f);
+                if (bits(sharply)) gleam = vpick(sharply, times(sharp, schlick(f0, f90)), gleam);
+                const V blurred = times(1.0f - sharp, f0);
+                V albedo = add(blurred, times(1.0f - through, product(sub(sub(f90, gleam), blurred), base_color)));
+                if (bits(coated)) {
+                    const F coat = clearcoat * schlick(grey(clearcoat_f0), same(1.0f)).x;
+                    const F sharp_coat = coat * sharp_share(clearcoat_roughness);
+                    albedo = vpick(coated, add(times(1.0f - coat, albedo), grey(coat - sharp_coat)), albedo);
+                    gleam = vpick(coated, add(times(1.0f - coat, gleam), grey(sharp_coat)), gleam);
+                }
+                base = vpick(seen, times(opacity, add(emissive, product(albedo, times(F(1.0f / pi), total)))), base);
+                mirror = vpick(seen, times(opacity, gleam), mirror);
+            } else {
+                onward = of_eye != 0 ? unit(ray) : ray;
+            }
+            const I dome = ~reflector & (size(mirror) > 0.0f);
+            if (bits(dome)) base = vpick(dome, add(base, product(mirror, dome_radiance(dome, onward))), base);
+        }
+        const V weight = vpick(reflector, mirror, same(0.0f));
         const F covered = pick(seen, F(1.0f), F(0.0f));
         if (of_eye == 0 && full) {
             vstore(radiance, start, base);
         } else if (full) {
             vstore4(picture, start, base, covered);
-            vstore(mirror, start, weight);
+            vstore(mirrors, start, weight);
         } else {
             for (int l = 0; l < end - start; ++l) {
                 const int i = start + l;
@@ -248,7 +260,7 @@ wp.set_module_options({"enable_backward": False})
                 of_base[0] = base.x[l]; of_base[1] = base.y[l]; of_base[2] = base.z[l];
                 if (of_eye == 0) continue;
                 of_base[3] = covered[l];
-                mirror[3 * i] = weight.x[l]; mirror[3 * i + 1] = weight.y[l]; mirror[3 * i + 2] = weight.z[l];
+                mirrors[3 * i] = weight.x[l]; mirrors[3 * i + 1] = weight.y[l]; mirrors[3 * i + 2] = weight.z[l];
             }
         }
     }

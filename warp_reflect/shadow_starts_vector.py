@@ -78,7 +78,7 @@ FLAT = module_part(__name__, "flat")
         const I quadric = (of_patch(&patches->shape, patch) == shape_quadric) & ~smooth.smooth;
         Quadric of;
         V q;
-        V n = hit_normal(seen, tri, patch, quadric, facet, at, u, v, smooth, of, q), p = at;
+        V n = hit_normal(seen, tri, patch, quadric, [&]() -> V { return facet; }, at, u, v, smooth, of, q), p = at;
         const F turned = pick(dot(n, way) > 0.0f, F(-1.0f), F(1.0f));
         const V side = times(pick(dot(facet, n) < 0.0f, -turned, turned), facet);
         if (bits(seen & smooth.smooth)) {
