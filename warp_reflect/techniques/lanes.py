@@ -85,6 +85,16 @@ VIRTUAL_VERTEX = r"""
             x = pick(before, x, x * inv);
             y = pick(before, y, y * inv);
         }
+        const int at = vertex[0];
+        if (bits(done & (vertex == at + lanes())) == bits(I(-1))) {
+            EACH_LANE status[at + l] = (unsigned char)answer[l];
+            store((float*)out_vertex.reach.data + at, reach);
+            store((float*)out_vertex.residual.data + at, residual);
+            vstore4(screen, at, V{x, y, key}, depth);
+            vstore(seeds, at, seed);
+            if (placed) vstore(positions, at, image);
+            return;
+        }
         // By memory: the compiler would store a whole vector for every lane that is taken out of it.
         const F each[9] = {x, y, key, depth, reach, residual, seed.x, seed.y, seed.z};
         float lane[9][LANES], place[3][LANES];
@@ -213,7 +223,10 @@ REFLECTOR_MAP = r"""
     };
     auto step_on_cube = [&](V x, V p, V step, F shrink) -> V {
         const V whitened = product(p, inv_extent), move = product(step, inv_extent);
-        const F cap = fmin(F(1.0f), step_cap * length(whitened) / fmax(length(move), F(1.0e-30f)));
+        F cap = F(1.0f);
+        // Hardly ever: what is no longer than nearly so much is not cut.
+        if (bits(dot(move, move) > 0.98f * step_cap * step_cap * dot(whitened, whitened)))
+            cap = fmin(cap, step_cap * length(whitened) / fmax(length(move), F(1.0e-30f)));
         return project_to_cube(add(times(size(whitened), x), times(cap * shrink, move)));
     };
 """

@@ -1,7 +1,8 @@
 """The Newton search in a reflector map (`map_search.solve_vertex`) for a block of vertices at a time.
 
 The same steps with the same decisions in every lane. Visible vertices of the block are moved together first, and again
-where few of a vector's lanes go on and where searches that did not end near a root start from a coarse seed.
+where few of a vector's lanes go on and where searches that did not end near a root start from a coarse seed. The vectors of
+a block take each evaluation in turn: every operation of a search waits for the one before it, those of its neighbours don't.
 """
 
 from __future__ import annotations
@@ -52,6 +53,11 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
     float at[X + 3][BLOCK + LANES], few[KEPT][FEW_ROW], far[X + 3][TASK + LANES];
     int vertex_of[BLOCK + LANES], few_vertex[FEW_ROW], few_used[FEW_ROW], far_vertex[TASK + LANES];
     int few_count = 0, far_count = 0;
+// Between what is read and what is written of a row: the compiler would make masked stores of them, which are slow.
+#define KEEP_APART(row) asm volatile("" : : "r"(&row) : "memory");
+    struct Search { V target, x, best, p, n, step; F residual, shrink; I asked, going, better, later, used; Sample s; };
+    constexpr int ROWS = BLOCK / LANES;
+    Search group[ROWS];
     // map_search.search_newton. A vector goes on while more than FEW of its lanes do: the others go on side by side after the
     // last block, and then those that ended far from a root start again from a coarse seed.
     for (int round = 0; round < BLOCKS + 2; ++round) {
@@ -184,109 +190,138 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
             numbers[l] = numbers[searched - 1];
             if (in_few) few_used[l] = few_used[searched - 1];
         }
-        for (int start = 0; start < searched; start += LANES) {
-            const float* row = rows + start;
-            const I asked = start + lanes() < searched;
-            const I vertex = iload(numbers + start);
-            const V target = V{load(row), load(row + ROW), load(row + 2 * ROW)};
-            V x = V{load(row + X * ROW), load(row + (X + 1) * ROW), load(row + (X + 2) * ROW)};
-            V best = same(0.0f), p = same(0.0f), n = same(0.0f), step = same(0.0f);
-            F residual = F(1.0e30f), shrink = F(1.0f);
-            I going = asked, used = I(0);
-            bool resumed = in_few;
-            if (resumed) {
-                best = x;
-                step = V{load(row + STEP * ROW), load(row + (STEP + 1) * ROW), load(row + (STEP + 2) * ROW)};
-                residual = load(row + RESIDUAL * ROW);
-                shrink = load(row + SHRINK * ROW);
-                used = iload(few_used + start);
+        // BLOCK of them at a time, evaluation by evaluation: what one vector waits for, its neighbours do.
+        for (int from = 0; from < searched; from += BLOCK) {
+            const int vectors = searched - from < BLOCK ? (searched - from + LANES - 1) / LANES : ROWS;
+            int open[ROWS], opened = vectors;
+            for (int k = 0; k < vectors; ++k) {
+                Search& g = group[k];
+                const int start = from + k * LANES;
+                const float* row = rows + start;
+                g.asked = g.going = start + lanes() < searched;
+                g.target = V{load(row), load(row + ROW), load(row + 2 * ROW)};
+                g.x = V{load(row + X * ROW), load(row + (X + 1) * ROW), load(row + (X + 2) * ROW)};
+                g.residual = F(1.0e30f);
+                g.shrink = F(1.0f);
+                g.later = g.used = I(0);
+                if (in_few) {
+                    g.best = g.x;
+                    g.step = V{load(row + STEP * ROW), load(row + (STEP + 1) * ROW), load(row + (STEP + 2) * ROW)};
+                    g.residual = load(row + RESIDUAL * ROW);
+                    g.shrink = load(row + SHRINK * ROW);
+                    g.used = iload(few_used + start);
+                }
+                open[k] = k;
             }
-            I later = I(0);
-            for (;;) {
-                const Sample s = sample(x);
-                I better;
-                if (resumed) {
-                    // Where the search stood: it was the best so far, and its step is known where that was shortened.
-                    better = going & (shrink == 1.0f);
-                    p = s.p;
-                    n = s.n;
-                    resumed = false;
-                } else {
-                    const F here = measure(s, target).residual;
-                    better = going & (here < residual);
-                    best = vpick(better, x, best);
-                    p = vpick(better, s.p, p);
-                    n = vpick(better, s.n, n);
-                    residual = pick(better, here, residual);
-                    shrink = pick(better, F(1.0f), shrink * retry_shrink);
-                    used += 1;
+            for (bool resumed = in_few; opened > 0; resumed = false) {
+                int on = 0;
+                for (int k = 0; k < opened; ++k) {
+                    Search& g = group[open[k]];
+                    const Sample s = sample(g.x);
+                    g.s = s;
+                    if (resumed) {
+                        // Where the search stood: it was the best so far, and its step is known where that was shortened.
+                        g.better = g.going & (g.shrink == 1.0f);
+                        g.p = s.p;
+                        g.n = s.n;
+                        on = opened;
+                        continue;
+                    }
+                    const F here = measure(s, g.target).residual;
+                    const I better = g.going & (here < g.residual);
+                    const F residual = pick(better, here, g.residual);
+                    const F shrink = pick(better, F(1.0f), g.shrink * retry_shrink);
+                    const I used = g.used + 1;
+                    const V best = vpick(better, g.x, g.best), p = vpick(better, s.p, g.p), n = vpick(better, s.n, g.n);
+                    KEEP_APART(g)
+                    g.best = best;
+                    g.p = p;
+                    g.n = n;
+                    g.residual = residual;
+                    g.shrink = shrink;
+                    g.used = used;
+                    g.better = better;
                     const F least = pick(residual <= accepted, F(shrink_near), F(shrink_min));
-                    going &= ~(residual <= settings.tolerance) & (shrink >= least) & (used < settings.iterations);
-                    const unsigned left = bits(going);
-                    if (left == 0) break;
-                    if (round < BLOCKS && __builtin_popcount(left) <= FEW) {
-                        later = going;
-                        break;
+                    const I open_still = ~(residual <= settings.tolerance) & (shrink >= least);
+                    const I going = g.going & open_still & (used < settings.iterations);
+                    const int left = __builtin_popcount(bits(going)), few_left = round < BLOCKS ? FEW : 0;
+                    g.going = going;
+                    g.later = left <= few_left ? going : I(0);
+                    open[on] = open[k];
+                    on += left > few_left;
+                }
+                opened = on;
+                for (int k = 0; k < opened; ++k) {
+                    Search& g = group[open[k]];
+                    const V step = vpick(g.better, newton_step(g.s, g.target), g.step);
+                    const V x = vpick(g.going, step_on_cube(g.best, g.p, step, g.shrink), g.x);
+                    KEEP_APART(g)
+                    g.step = step;
+                    g.x = x;
+                }
+            }
+            for (int k = 0; k < vectors; ++k) {
+                const Search& g = group[k];
+                const int start = from + k * LANES;
+                const V target = g.target, best = g.best, p = g.p, n = g.n;
+                const F residual = g.residual;
+                const I asked = g.asked, later = g.later, vertex = iload(numbers + start);
+                if (bits(later)) {
+                    const F each[KEPT] = {target.x, target.y, target.z, best.x, best.y, best.z, g.step.x, g.step.y, g.step.z,
+                        residual, g.shrink};
+                    float lane[KEPT][LANES];
+                    int count_of[LANES];
+                    for (int k = 0; k < KEPT; ++k) store(lane[k], each[k]);
+                    istore(count_of, g.used);
+                    for (unsigned left = bits(later); left != 0; left &= left - 1) {
+                        const int l = __builtin_ctz(left);
+                        for (int k = 0; k < KEPT; ++k) few[k][few_count] = lane[k][l];
+                        few_used[few_count] = count_of[l];
+                        few_vertex[few_count++] = numbers[start + l];
                     }
                 }
-                step = vpick(better, newton_step(s, target), step);
-                x = vpick(going, step_on_cube(best, p, step, shrink), x);
-            }
-            if (bits(later)) {
-                const F each[KEPT] = {target.x, target.y, target.z, best.x, best.y, best.z, step.x, step.y, step.z,
-                    residual, shrink};
-                float lane[KEPT][LANES];
-                int count_of[LANES];
-                for (int k = 0; k < KEPT; ++k) store(lane[k], each[k]);
-                istore(count_of, used);
-                for (unsigned left = bits(later); left != 0; left &= left - 1) {
-                    const int l = __builtin_ctz(left);
-                    for (int k = 0; k < KEPT; ++k) few[k][few_count] = lane[k][l];
-                    few_used[few_count] = count_of[l];
-                    few_vertex[few_count++] = numbers[start + l];
+                I done = asked & ~later & (residual <= accepted), answer = I(converged);
+                I rest = asked & ~later & ~done;
+                if (bits(rest) && !in_coarse) {
+                    // map_search.is_straight
+                    const V to_eye = sub(eye, p), to_target = sub(target, p);
+                    const V w = add(times(1.0f / fmax(length(to_eye), F(1.0e-20f)), to_eye),
+                        times(1.0f / fmax(length(to_target), F(1.0e-20f)), to_target));
+                    const I again = rest & ~((residual > map.accepted) & (dot(w, w) < straight * straight));
+                    for (unsigned left = bits(again); left != 0; left &= left - 1) {
+                        const int l = __builtin_ctz(left);
+                        for (int k = 0; k < 3; ++k) far[k][far_count] = rows[k * ROW + start + l];
+                        far_vertex[far_count++] = numbers[start + l];
+                    }
+                    rest &= ~again;
                 }
-            }
-            I done = asked & ~later & (residual <= accepted), answer = I(converged);
-            I rest = asked & ~later & ~done;
-            if (bits(rest) && !in_coarse) {
-                // map_search.is_straight
-                const V to_eye = sub(eye, p), to_target = sub(target, p);
-                const V w = add(times(1.0f / fmax(length(to_eye), F(1.0e-20f)), to_eye),
-                    times(1.0f / fmax(length(to_target), F(1.0e-20f)), to_target));
-                const I again = rest & ~((residual > map.accepted) & (dot(w, w) < straight * straight));
-                for (unsigned left = bits(again); left != 0; left &= left - 1) {
-                    const int l = __builtin_ctz(left);
-                    for (int k = 0; k < 3; ++k) far[k][far_count] = row[k * ROW + l];
-                    far_vertex[far_count++] = numbers[start + l];
+                if (bits(rest)) {
+                    // map_search.solve_vertex: what is not near a root.
+                    const Sample s = sample(best);
+                    const Law law = measure(s, target);
+                    const I closing = s.mask < 0.5f, off = residual > map.accepted;
+                    const I grazing = ~(fmin(law.cos_eye, law.cos_target) >= grazing_cos);
+                    const I without = ipick(grazing, I(hidden), ipick(closing, I(unreflected), I(max_iterations)));
+                    const I nothing = rest & off & ((without != max_iterations) | (residual > settings.accepted));
+                    int as[LANES];
+                    float lane[4][LANES];
+                    istore(as, without);
+                    store(lane[0], best.x); store(lane[1], best.y); store(lane[2], best.z); store(lane[3], residual);
+                    for (unsigned left = bits(nothing); left != 0; left &= left - 1) {
+                        const int l = __builtin_ctz(left), i = numbers[start + l];
+                        status[i] = (unsigned char)as[l];
+                        out_vertex.residual.data[i] = lane[3][l];
+                        for (int k = 0; k < 3; ++k) seeds[3 * i + k] = lane[k][l];
+                        screen[4 * i] = screen[4 * i + 1] = screen[4 * i + 3] = 0.0f;
+                        screen[4 * i + 2] = -1.0f;
+                    }
+                    done |= rest & ~nothing;
+                    answer = ipick(rest & ~closing, I(max_iterations), answer);
                 }
-                rest &= ~again;
+                if (!bits(done)) continue;
+                const F reach = edge_reach(p, n, target, F(map.least_curvature));
+                settle(done, answer, vertex, best, residual, virtual_vertex(p, n, target), reach);
             }
-            if (bits(rest)) {
-                // map_search.solve_vertex: what is not near a root.
-                const Sample s = sample(best);
-                const Law law = measure(s, target);
-                const I closing = s.mask < 0.5f, off = residual > map.accepted;
-                const I grazing = ~(fmin(law.cos_eye, law.cos_target) >= grazing_cos);
-                const I without = ipick(grazing, I(hidden), ipick(closing, I(unreflected), I(max_iterations)));
-                const I nothing = rest & off & ((without != max_iterations) | (residual > settings.accepted));
-                int as[LANES];
-                float lane[4][LANES];
-                istore(as, without);
-                store(lane[0], best.x); store(lane[1], best.y); store(lane[2], best.z); store(lane[3], residual);
-                for (unsigned left = bits(nothing); left != 0; left &= left - 1) {
-                    const int l = __builtin_ctz(left), i = numbers[start + l];
-                    status[i] = (unsigned char)as[l];
-                    out_vertex.residual.data[i] = lane[3][l];
-                    for (int k = 0; k < 3; ++k) seeds[3 * i + k] = lane[k][l];
-                    screen[4 * i] = screen[4 * i + 1] = screen[4 * i + 3] = 0.0f;
-                    screen[4 * i + 2] = -1.0f;
-                }
-                done |= rest & ~nothing;
-                answer = ipick(rest & ~closing, I(max_iterations), answer);
-            }
-            if (!bits(done)) continue;
-            const F reach = edge_reach(p, n, target, F(map.least_curvature));
-            settle(done, answer, vertex, best, residual, virtual_vertex(p, n, target), reach);
         }
     }
 """.replace("COARSE_NODES", str(COARSE_NODES)).replace("BLOCKS", str(BLOCKS)),
