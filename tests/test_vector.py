@@ -11,7 +11,7 @@ import warp as wp
 from rooms import CHROME, placed, plane_room, room, sphere, square
 
 import warp_reflect as wr
-from warp_reflect import raster, reflector_maps, surface, vector
+from warp_reflect import raster, reflector_maps, surface, surface_vector, vector
 from warp_reflect.layers import Camera, CameraView
 from warp_reflect.raster import make_target, rasterise
 from warp_reflect.scene import CameraData, InstanceData, LightData, MaterialData, Scene, SceneData
@@ -128,6 +128,29 @@ def test_what_is_left_out_behind_others_is_hidden_by_them(seed):
     assert (plain > 0).all()
     for threads in (1, 3):
         np.testing.assert_array_equal(drawn("vector", screen, triangles, width, height, threads=threads), plain)
+
+
+@pytest.mark.parametrize("wanted", [(1,), (2, 9, 4, 5)])
+@pytest.mark.parametrize("kind", ["none", "one", "scattered", "blocks"])
+@pytest.mark.parametrize("count", [5, 64, 9001])
+def test_pixels_of_each_id_are_listed(count, kind, wanted):
+    rng = np.random.default_rng(count)
+    patch_id = np.array([0, *wanted], np.int32)
+    triangle = np.full(count, -1, np.int32)
+    if kind == "one":
+        triangle[:] = 1
+    elif kind == "scattered":
+        triangle = rng.integers(-1, len(patch_id), count, dtype=np.int32)
+    elif kind == "blocks":
+        triangle = np.repeat(rng.integers(-1, len(patch_id), count // 20 + 1, dtype=np.int32), 20)[:count]
+    expected = np.where(triangle >= 0, patch_id[triangle], 0)
+    given = [wp.array(each, dtype=int, device=CPU) for each in (triangle, np.arange(len(patch_id)), patch_id)]
+    for threads in (1, 2):
+        ids, pixels = surface_vector.pixels_by_id(*given, max(wanted), threads)
+        np.testing.assert_array_equal(ids.numpy(), expected)
+        assert len(pixels) == max(wanted)
+        for id, pixel in enumerate(pixels, 1):
+            np.testing.assert_array_equal(pixel.numpy(), np.flatnonzero(expected == id))
 
 
 def test_bands_of_rows_have_whole_tiles():

@@ -319,14 +319,15 @@ def _pixels_of(
 ) -> tuple[dict[int, tuple[wp.array, Box]], wp.array]:
     """(by id: the ascending pixels that show a part, and their bounds; id per pixel, 0 where there is none of the parts)."""
     width, height = gbuffer.camera.size
-    ids = wp.empty(width * height, dtype=int, device=scene.device)
-    inputs = [gbuffer.triangle, scene.view.triangle_patch, _id_of_patch(scene, parts, who), ids]
-    if vector.chosen(kernels, scene.device):
+    inputs = [gbuffer.triangle, scene.view.triangle_patch, _id_of_patch(scene, parts, who)]
+    if vector.chosen(kernels, scene.device) and not launch.stays(scene.device):
         from warp_reflect import surface_vector  # which reflects at this module's surface
 
-        vector.launch_blocks(surface_vector.id_blocks_kernel, width * height, inputs, scene.device, threads)
-    else:
-        launch.launch(reflector_id_kernel, width * height, inputs, scene.device, threads)
+        if max(parts) <= surface_vector.LISTED_IDS:
+            ids, pixels = surface_vector.pixels_by_id(*inputs, max(parts), threads)
+            return {id: (pixels[id - 1], pixel_bounds(pixels[id - 1].numpy(), width)) for id in parts}, ids
+    ids = wp.empty(width * height, dtype=int, device=scene.device)
+    launch.launch(reflector_id_kernel, width * height, [*inputs, ids], scene.device, threads)
     if launch.stays(scene.device):
         return _sorted_by_id(ids, parts, width), ids
     found = _pixels_by_id(ids.numpy(), parts)

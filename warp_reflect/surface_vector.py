@@ -5,9 +5,13 @@ What needs a second look (near a silhouette, without area, a quadric in parallel
 
 from __future__ import annotations
 
+from itertools import pairwise
+
+import numpy as np
 import warp as wp
 
 from warp_reflect import vector
+from warp_reflect.compact import listed
 from warp_reflect.hits_vector import HITS
 from warp_reflect.layers import CameraView
 from warp_reflect.scene import SHAPE_PLANE, SHAPE_QUADRIC, SceneView
@@ -16,6 +20,7 @@ from warp_reflect.surface import LEAST_NORMAL, SURE_SLOPE, mirror_pixel
 wp.set_module_options({"enable_backward": False})
 
 BLOCK = wp.constant(vector.BLOCK)
+LISTED_IDS = 32  # each has a number in every block of pixels
 
 
 @wp.func_native(
@@ -178,27 +183,37 @@ def mirror_blocks_kernel(
 
 @wp.func_native(
     vector.snippet(r"""
-    const int end = begin + BLOCK < triangle.shape[0] ? begin + BLOCK : triangle.shape[0];
+    const int begin = block * BLOCK, end = begin + BLOCK < triangle.shape[0] ? begin + BLOCK : triangle.shape[0];
+    const int blocks = (triangle.shape[0] + BLOCK - 1) / BLOCK, kinds = out_count.shape[0] / blocks;
     const int* seen = triangle.data;
+    int* own = out_count.data + block - blocks;
+    for (int id = 1; id <= kinds; ++id) own[id * blocks] = 0;
     auto id_of = [&](int t) -> int { return t < 0 ? 0 : patch_id.data[triangle_patch.data[t]]; };
+    auto count = [&](int id, int pixels) { if (id != 0) own[id * blocks] += pixels; };
     int i = begin;
     for (; i + LANES <= end; i += LANES) {
         const I t = iload(seen + i);
         I id;
         // Side by side lie pixels of one triangle, and where there is nothing.
-        if (!bits(t != seen[i])) id = I(id_of(seen[i]));
-        else EACH_LANE id[l] = id_of(t[l]);
+        if (!bits(t != seen[i])) {
+            id = I(id_of(seen[i]));
+            count(id[0], LANES);
+        } else EACH_LANE {
+            id[l] = id_of(t[l]);
+            count(id[l], 1);
+        }
         istore(out_id.data + i, id);
     }
-    for (; i < end; ++i) out_id.data[i] = id_of(seen[i]);
+    for (; i < end; ++i) count(out_id.data[i] = id_of(seen[i]), 1);
 """)
 )
 def id_block(
-    begin: int,
+    block: int,
     triangle: wp.array(dtype=int),
     triangle_patch: wp.array(dtype=int),
     patch_id: wp.array(dtype=int),
     out_id: wp.array(dtype=int),
+    out_count: wp.array(dtype=int),
 ): ...
 
 
@@ -209,6 +224,58 @@ def id_blocks_kernel(
     triangle_patch: wp.array(dtype=int),
     patch_id: wp.array(dtype=int),
     out_id: wp.array(dtype=int),
+    out_count: wp.array(dtype=int),
 ):
-    """As `surface.reflector_id_kernel`, one thread per block of pixels."""
-    id_block((first + wp.tid()) * BLOCK, triangle, triangle_patch, patch_id, out_id)
+    """As `surface.reflector_id_kernel`, one thread per block of pixels; for each id, of every block how many have it."""
+    id_block(first + wp.tid(), triangle, triangle_patch, patch_id, out_id, out_count)
+
+
+@wp.func_native(
+    vector.snippet(
+        f"    constexpr int MOST = {LISTED_IDS};"
+        + r"""
+    const int begin = block * BLOCK, end = begin + BLOCK < ids.shape[0] ? begin + BLOCK : ids.shape[0];
+    const int blocks = (ids.shape[0] + BLOCK - 1) / BLOCK, kinds = place.shape[0] / blocks;
+    int* next[MOST + 1];
+    for (int id = 1; id <= kinds; ++id) next[id] = out_pixel.data + place.data[(id - 1) * blocks + block];
+    int i = begin;
+    for (; i + LANES <= end; i += LANES) {
+        const I id = iload(ids.data + i);
+        if (!bits(id != id[0])) {
+            if (id[0] == 0) continue;
+            istore(next[id[0]], i + lanes());
+            next[id[0]] += LANES;
+        } else EACH_LANE if (id[l] != 0) *next[id[l]]++ = i + l;
+    }
+    for (; i < end; ++i) if (ids.data[i] != 0) *next[ids.data[i]]++ = i;
+"""
+    )
+)
+def list_block(block: int, ids: wp.array(dtype=int), place: wp.array(dtype=int), out_pixel: wp.array(dtype=int)): ...
+
+
+@wp.kernel
+def list_blocks_kernel(
+    first: int, ids: wp.array(dtype=int), place: wp.array(dtype=int), out_pixel: wp.array(dtype=int)
+):
+    """One thread per block of pixels: the pixels of each id, from the place of that id's and that block's first one on."""
+    list_block(first + wp.tid(), ids, place, out_pixel)
+
+
+def pixels_by_id(
+    triangle: wp.array, triangle_patch: wp.array, patch_id: wp.array, ids: int, threads: int
+) -> tuple[wp.array, list[wp.array]]:
+    """Which pixels have each of the ids from 1 on, at most `LISTED_IDS`.
+
+    Returns:
+        (id per pixel, int32, 0 none; for each id its pixels, ascending, int32).
+    """
+    count, device = len(triangle), triangle.device
+    id, counts = (wp.empty(n, dtype=int, device=device) for n in (count, ids * vector.block_count(count)))
+    vector.launch_blocks(id_blocks_kernel, count, [triangle, triangle_patch, patch_id, id, counts], device, threads)
+    ends = np.cumsum(counts.numpy(), dtype=np.int32)
+    place = listed(ends - counts.numpy(), device)
+    pixel = wp.empty(int(ends[-1]), dtype=int, device=device)
+    vector.launch_blocks(list_blocks_kernel, count, [id, place, pixel], device, threads)
+    edges = [0, *ends[vector.block_count(count) - 1 :: vector.block_count(count)].tolist()]
+    return id, [listed(pixel.numpy()[start:end], device) for start, end in pairwise(edges)]
