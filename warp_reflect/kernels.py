@@ -43,7 +43,7 @@ ROWS = {
         "-techniques.local_map",
     ),
     "raytraced": ("bvh", "|wide_tree", "|bvh_vector"),
-    "refinement": ("|techniques.refine_vector", "-techniques.refine"),
+    "refinement": ("|raster_rays_vector", "|techniques.refine_vector", "-techniques.refine"),
     "grid": ("techniques.interpolation",),
     "second_bounce": ("bounces", "-bvh/bounced"),
     "clearcoat": ("finishes.coat",),

@@ -493,9 +493,9 @@ def attach_rays(
     x0, y0, x1, _ = target.box
     inputs = [camera, pixels.pixel, pixels.point, pixels.direction, x0, y0, x1 - x0, target.view.ray]
     if vector.chosen(kernels, device):
-        from warp_reflect import raster_vector  # which draws with this module's functions
+        from warp_reflect import raster_rays_vector  # which draws with this module's functions
 
-        vector.launch_blocks(raster_vector.ray_blocks_kernel, pixels.count, inputs, device, threads)
+        vector.launch_blocks(raster_rays_vector.ray_blocks_kernel, pixels.count, inputs, device, threads)
     else:
         launch(ray_image_kernel, pixels.count, inputs, device, threads)
 
@@ -568,18 +568,38 @@ def rasterise(
     parts = shared_by(count, device, threads)
     step = count if parts == 1 else -(-count // (parts * CULL_RUNS * vector.BLOCK)) * vector.BLOCK
     vectors = vector.chosen(kernels, device)
-    hides = vectors and target.view.ray.shape[0] == 0  # rays tell the depth late: nothing is known to lie behind
-    survivors = wp.empty(count, dtype=int, device=device)
-    survivor_count = wp.zeros(-(-count // step), dtype=int, device=device)
-    nearest = wp.empty(count if hides else 0, dtype=float, device=device)
-    inputs = [target.view, screen, triangles, step, survivors, survivor_count, nearest]
-    launch(cull_kernel, count, inputs, device, threads, align=step)
     if ids is None:
         ids = wp.empty(0, dtype=int, device=device)
     if points is None:
         points = wp.empty(0, dtype=wp.vec3, device=device)
     named = [triangles, ids, id_offset]
     planes = [points, triangles if plane_triangles is None else plane_triangles]
+
+    def bands(some: np.ndarray) -> list[tuple[int, int]]:
+        """Of rows, a thread each, as these triangles lie."""
+        if parts == 1:
+            return [(target.box[1], target.box[3])]
+        corners = screen.numpy()[triangles.numpy()[some, 0]]
+        return balanced_bands(target.box, corners[corners[:, 2] >= 0.0, 1], parts)
+
+    if vectors and target.view.ray.shape[0] > 0:
+        from warp_reflect import raster_rays_vector  # as above
+
+        survivor_count = wp.zeros(1, dtype=int, device=device)
+        inputs = [target.view, screen, *named, *planes, survivor_count]
+        some = np.arange(0, count, BALANCED_BY)
+        launch_bands(raster_rays_vector.draw_rays_kernel, vector.block_count(count), bands(some), inputs, device)
+        return survivor_count
+    hides = False
+    if vectors:
+        from warp_reflect import raster_vector  # as above
+
+        hides = target.box[2] - target.box[0] >= raster_vector.WIDTH_MIN
+    survivors = wp.empty(count, dtype=int, device=device)
+    survivor_count = wp.zeros(-(-count // step), dtype=int, device=device)
+    nearest = wp.empty(count if hides else 0, dtype=float, device=device)
+    inputs = [target.view, screen, triangles, step, survivors, survivor_count, nearest]
+    launch(cull_kernel, count, inputs, device, threads, align=step)
     if stays(device):
         inputs = [target.view, screen, *named, step, survivors, survivor_count, *planes, target.box[1], target.box[3]]
         launch(draw_kernel, count, inputs, device)
@@ -588,20 +608,13 @@ def rasterise(
     drawn = np.concatenate([survivors.numpy()[run] for run in runs])
     if hides:
         drawn = nearest_first(drawn, np.concatenate([nearest.numpy()[run] for run in runs]))
-    step = tasks = len(drawn)
-    drawn, drawn_count = (listed(numbers, device) for numbers in (drawn, np.array([step], np.int32)))
-    inputs = [target.view, screen, *named, step, drawn, drawn_count, *planes]
-    kernel = draw_kernel
-    if vectors:
-        from warp_reflect import raster_vector  # which draws with this module's functions
-
-        kernel, tasks = raster_vector.draw_blocks_kernel, vector.block_count(step)
-        inputs.append(wp.zeros(raster_vector.tile_words(target.box) if hides else 0, dtype=wp.uint64, device=device))
-    bands = [(target.box[1], target.box[3])]
-    if parts > 1 and tasks:
-        some = triangles.numpy()[drawn.numpy()[::BALANCED_BY], 0]
-        bands = balanced_bands(target.box, screen.numpy()[some, 1], parts)
-    launch_bands(kernel, tasks, bands, inputs, device)
+    kernel, tasks, left = draw_kernel, len(drawn), planes
+    if hides:
+        kernel, tasks = raster_vector.draw_blocks_kernel, vector.block_count(len(drawn))
+        left = [wp.zeros(raster_vector.tile_words(target.box), dtype=wp.uint64, device=device)]
+    numbers, length = (listed(each, device) for each in (drawn, np.array([len(drawn)], np.int32)))
+    inputs = [target.view, screen, *named, len(drawn), numbers, length, *left]
+    launch_bands(kernel, tasks, bands(drawn[::BALANCED_BY]), inputs, device)
     return survivor_count
 
 

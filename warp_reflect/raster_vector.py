@@ -1,12 +1,10 @@
-"""`raster.draw_kernel` with triangles and pixels side by side: the same picture, bit for bit.
+"""`raster.draw_kernel` without rays, with triangles and pixels side by side: the same picture, bit for bit.
 
 Triangles are set up in vectors, and those within a box of 64 pixels are drawn without further ado; larger ones one at a time,
-and what has to be clipped by the plain kernel's functions. In the eye view, whose fragments need no memory but their own keys,
-pixels that lie side by side are drawn at once, tile by tile of 64 pixels: a tile remembers what it is covered by, and what
-lies behind that is not drawn (Hasselgren, Andersson and Akenine-Moeller, Masked Software Occlusion Culling, HPG 2016, section
-3, with one layer; here nothing is lost by it, as the depths themselves are kept too). Where rays tell the depth, what several
-triangles cover is gathered in one list: its vectors are full however few pixels a triangle has, and what a fragment needs of
-memory has been asked for by the time it is worked on.
+and what has to be clipped by the plain kernel's functions. Fragments need no memory but their own keys: pixels that lie side by
+side are drawn at once, tile by tile of 64 pixels. A tile remembers what it is covered by, and what lies behind that is not
+drawn (Hasselgren, Andersson and Akenine-Moeller, Masked Software Occlusion Culling, HPG 2016, section 3, with one layer; here
+nothing is lost by it, as the depths themselves are kept too).
 
 Edge functions of a triangle within a box of 64 pixels are exact in 32 bits (products below 2^29, sums of two below 2^30, and a
 vector reaches at most 15 pixels past the box); of larger ones in float64, whose 53 bits hold everything below 2^46, or in
@@ -18,24 +16,19 @@ from __future__ import annotations
 import warp as wp
 
 from warp_reflect import vector
-from warp_reflect.launch import module_part
-from warp_reflect.layers import CameraView
 from warp_reflect.raster import (
     GUARD,
-    RAY_ALONG_MIN,
-    RAY_TRUST,
     PlaneView,
     TargetView,
     at_depth,
     draw_clipped,
     needs_clipping,
-    triangle_plane,
 )
 
 wp.set_module_options({"enable_backward": False})
 
-RAYS = module_part(__name__, "rays")
 BLOCK = wp.constant(vector.BLOCK)
+WIDTH_MIN = 16  # pixels: the most lanes
 
 
 def tile_words(box: tuple[int, int, int, int]) -> int:
@@ -50,10 +43,7 @@ _TARGET = r"""
     // raster.edge_bias
     auto edge_bias = [](I dx, I dy) -> I { return ((dy < 0) | ((dy == 0) & (dx > 0))) ? I(0) : I(-1); };
     const int width = target.x1 - target.x0;
-    const bool rays = target.ray.shape[0] > 0;
-    // A masked target with rays has none outside its mask.
-    const bool masked = target.mask_value > 0 && !rays;
-    const float* ray_of = (const float*)target.ray.data;
+    const bool masked = target.mask_value > 0;
     unsigned long long* keys = (unsigned long long*)target.key.data;
     const F key_min = F(target.key_min);
     auto marks = [&](I mask) -> unsigned {
@@ -64,9 +54,8 @@ _TARGET = r"""
 #endif
     };
 
-    // Without rays a fragment needs no memory but its key: rows of keys are worked on as they lie, LANES side by side.
-    const bool in_rows = !rays && width >= LANES;
-    // Keys as their halves, without a shuffle across 128 bits: lane l has the key `place(l)`.
+    // Rows of keys are worked on as they lie, LANES side by side: as their halves, without a shuffle across 128 bits, where
+    // lane l has the key `place(l)`.
     auto place = [](int l) -> int { return (l & 1) + ((l >> 2) << 1) + ((l & 2) ? LANES / 2 : 0); };
     I places;
     EACH_LANE places[l] = place(l);
@@ -132,41 +121,6 @@ _TARGET = r"""
     // Keys between which the depths of a triangle with these lie, as they are rounded.
     auto above = [](auto key) { return key * 1.000001f + 1.0e-37f; };
     auto below = [](auto key) { return key * 0.999999f - 1.0e-37f; };
-
-    // Fragments of interpolated keys at cells, of triangles with these planes and, by owner, complements of their numbers;
-    // raster.ray_key where there are rays.
-    auto put = [&](I inside, I cell, F depth, V n, F offset, I owner, const int* low_of) {
-        inside &= depth > key_min;
-        F now;
-        EACH_LANE now[l] = __builtin_bit_cast(float, (unsigned)(keys[cell[l]] >> 32));
-        if (rays) {
-            F ray[8];
-            gather8(ray_of, 8 * cell, ray);
-            const V o = V{ray[0], ray[1], ray[2]}, d = V{ray[4], ray[5], ray[6]};
-            const F o_w = ray[3], d_w = ray[7];
-            const F path = d_w / depth;
-            const F along = n.x * d.x + n.y * d.y + n.z * d.z;
-            const F height = offset - n.x * o.x - n.y * o.y - n.z * o.z;
-            const F linear = path - o_w;
-            const F t = height / along;
-            const I trusted = (__builtin_elementwise_abs(along) > ray_along_min)
-                & (__builtin_elementwise_abs(t - linear) < ray_trust * path);
-            const F total = o_w + pick(trusted, fmax(t, F(0.0f)), linear);
-            depth = 1.0f / fmax(total, F(1.0e-30f));
-            inside &= d_w > 0.0f;
-        }
-        float depths[LANES];
-        int cells[LANES], owners[LANES];
-        store(depths, depth);
-        istore(cells, cell);
-        istore(owners, owner);
-        for (unsigned left = bits(inside & (depth >= now)); left != 0; left &= left - 1) {
-            const int l = __builtin_ctz(left);
-            const unsigned high = __builtin_bit_cast(unsigned, depths[l]);
-            const unsigned long long key = ((unsigned long long)high << 32) | (unsigned)low_of[owners[l]];
-            if (key > keys[cells[l]]) keys[cells[l]] = key;
-        }
-    };
 """
 
 
@@ -174,53 +128,17 @@ _TARGET = r"""
     vector.snippet(
         _TARGET
         + r"""
-    constexpr int LISTED = 256;  // fragments that are worked on together
-    constexpr int ROWS_MAX = 66;  // of a box of 64 pixels, and one to read past
-    constexpr int LIST_MAX = LISTED + ROWS_MAX * LANES;
     // The most that an edge function grows by from the first pixel of a tile on.
     auto over = [](I dx, I dy) -> I {
         return (dx > 0 ? dx * (256 * (TILE_ROWS - 1)) : 0) - (dy < 0 ? dy * (256 * (LANES - 1)) : 0);
     };
     auto least = [](I p, I q) -> I { return p < q ? p : q; };
     auto most = [](I p, I q) -> I { return p > q ? p : q; };
-    auto apart = [](V a, F s) -> V { return V{a.x / s, a.y / s, a.z / s}; };
     const int* corner_of = (const int*)triangles.data;
-    const int* plane_corner_of = (const int*)plane_triangles.data;
     const int* numbers = survivors.data + begin;
-    const float* point_of = (const float*)points.data;
     const float* screen_of = (const float*)screen.data;
     const int row0 = target.y0 > row_first ? target.y0 : row_first;
     const int row1 = target.y1 < row_end ? target.y1 : row_end;
-
-    // Of a triangle: its plane, and the complement of its number.
-    float plane_of[BLOCK * 8];
-    int low_of[BLOCK];
-    int cells[LIST_MAX], owners[LIST_MAX];
-    float depths[LIST_MAX];
-    int listed = 0;
-    auto flush = [&]() {
-        for (int start = 0; start < listed; start += LANES) {
-            const I valid = start + lanes() < listed;
-            const I cell = ipick(valid, iload(cells + start), I(cells[start]));
-            const I owner = ipick(valid, iload(owners + start), I(owners[start]));
-            I inside = valid;
-            if (masked) {
-                const I row = cell / width;
-                const I at = (target.y0 + row) * target.mask_width + target.x0 + cell - row * width;
-                inside &= igather(target.mask.data, at) == target.mask_value;
-            }
-            V n = same(0.0f);
-            F offset = F(0.0f);
-            if (rays) {
-                F plane[8];
-                gather8(plane_of, 8 * owner, plane);
-                n = V{plane[0], plane[1], plane[2]};
-                offset = plane[3];
-            }
-            put(inside, cell, load(depths + start), n, offset, owner, low_of);
-        }
-        listed = 0;
-    };
 
     unsigned long long others = 0;
     for (int start = 0; start < count; start += LANES) {
@@ -276,17 +194,14 @@ _TARGET = r"""
         const I dxa = xc - xb, dya = yc - yb, dxb = xa - xc, dyb = ya - yc, dxc = xb - xa, dyc = yb - ya;
         const I px = ipick(drawn, left * 256 + 128, I(0)), py = ipick(drawn, top * 256 + 128, I(0));
         const F inv_area = 1.0f / __builtin_convertvector(area, F);
-        // Of every triangle: edges at the first pixel, the largest that is outside, steps, and what is left of it.
-        enum { EA, EB, EC, OUT_A, OUT_B, OUT_C, BIAS_A, BIAS_B, BIAS_C, OVER_A, OVER_B, OVER_C,
-            DXA, DXB, DXC, DYA, DYB, DYC, COLUMN, COLUMNS, ROW, ROWS, CELL, FIELDS };
+        // Of every triangle: edges at the first pixel, steps, and what is left of it.
+        enum { EA, EB, EC, BIAS_A, BIAS_B, BIAS_C, OVER_A, OVER_B, OVER_C,
+            DXA, DXB, DXC, DYA, DYB, DYC, COLUMN, COLUMNS, ROW, ROWS, LOW, FIELDS };
         int field[FIELDS][LANES];
         istore(field[EA], dxa * (py - yb) - dya * (px - xb));
         istore(field[EB], dxb * (py - yc) - dyb * (px - xc));
         istore(field[EC], dxc * (py - ya) - dyc * (px - xa));
         const I bias[3] = {edge_bias(dxa, dya), edge_bias(dxb, dyb), edge_bias(dxc, dyc)};
-        istore(field[OUT_A], -1 - bias[0]);
-        istore(field[OUT_B], -1 - bias[1]);
-        istore(field[OUT_C], -1 - bias[2]);
         istore(field[BIAS_A], bias[0]);
         istore(field[BIAS_B], bias[1]);
         istore(field[BIAS_C], bias[2]);
@@ -303,7 +218,7 @@ _TARGET = r"""
         istore(field[COLUMNS], right - left);
         istore(field[ROW], top - target.y0);
         istore(field[ROWS], bottom - top);
-        istore(field[CELL], (top - target.y0) * width + left - target.x0);
+        istore(field[LOW], ~(ids.shape[0] > 0 ? igather(ids.data, t) : t + id_offset));
         float keys_a[LANES], keys_b[LANES], keys_c[LANES], inverse[LANES];
         store(keys_a, k[0]);
         store(keys_b, kb);
@@ -312,27 +227,7 @@ _TARGET = r"""
         float most_key[LANES], least_key[LANES];
         store(most_key, above(fmax(k[0], fmax(kb, kc))));
         store(least_key, below(fmin(k[0], fmin(kb, kc))));
-        istore(low_of + start, ~(ids.shape[0] > 0 ? igather(ids.data, t) : t + id_offset));
-        if (rays) {
-            // raster.triangle_plane
-            V p[3];
-            _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each)
-                p[each] = vgather(point_of, igather(plane_corner_of, 3 * t + each));
-            V n = cross(sub(p[1], p[0]), sub(p[2], p[0]));
-            const F square = dot(n, n);
-            const I safe = (square > 1.0e-24f) & (square < 1.0e24f);
-            V plane = times(1.0f / __builtin_elementwise_sqrt(square), n);
-            if (bits(~safe)) {
-                const V s = apart(n, size(n));
-                plane = vpick(safe, plane, vpick(size(n) == 0.0f, same(0.0f), apart(s, __builtin_elementwise_sqrt(dot(s, s)))));
-            }
-            const F offset = dot(plane, p[0]);
-            EACH_LANE {
-                float* to = plane_of + 8 * (start + l);
-                to[0] = plane.x[l]; to[1] = plane.y[l]; to[2] = plane.z[l]; to[3] = offset[l];
-            }
-        }
-        for (unsigned left_over = in_rows ? bits(drawn) : 0; left_over != 0; left_over &= left_over - 1) {
+        for (unsigned left_over = bits(drawn); left_over != 0; left_over &= left_over - 1) {
             const int l = __builtin_ctz(left_over);
             const int x_first = field[COLUMN][l], x_last = x_first + field[COLUMNS][l];
             const int y_first = field[ROW][l], y_last = y_first + field[ROWS][l];
@@ -355,7 +250,7 @@ _TARGET = r"""
                 const int c = field[EC][l] + (y - y_first) * row_c - (x - x_first) * step_c;
                 if (((a + field[OVER_A][l]) | (b + field[OVER_B][l]) | (c + field[OVER_C][l])) < 0) return 0;
                 return draw_rows(x, y, count, a + across_a, b + across_b, c + across_c, I(row_a), I(row_b), I(row_c),
-                    U((unsigned)low_of[start + l]), depth_of);
+                    U((unsigned)field[LOW][l]), depth_of);
             };
             if (y_last - y_first < TILE_ROWS && x_last - x_first < LANES) {
                 // So small that it is drawn sooner than looked for behind others.
@@ -373,50 +268,7 @@ _TARGET = r"""
                 }
             }
         }
-        if (in_rows) continue;
-        for (unsigned left_over = bits(drawn); left_over != 0; left_over &= left_over - 1) {
-            const int l = __builtin_ctz(left_over);
-            const int owner = start + l, columns = field[COLUMNS][l], rows = field[ROWS][l];
-            const I step_a = I(field[DYA][l]), step_b = I(field[DYB][l]), step_c = I(field[DYC][l]);
-            const I row_a = I(field[DXA][l]), row_b = I(field[DXB][l]), row_c = I(field[DXC][l]);
-            const I out_a = I(field[OUT_A][l]), out_b = I(field[OUT_B][l]), out_c = I(field[OUT_C][l]);
-            const F key_a = F(keys_a[l]), key_b = F(keys_b[l]), key_c = F(keys_c[l]), inv = F(inverse[l]);
-            for (int x = 0; x <= columns; x += LANES) {
-                const I column = x + lanes();
-                const I within = column <= columns;
-                I ea = field[EA][l] - column * step_a, eb = field[EB][l] - column * step_b, ec = field[EC][l] - column * step_c;
-                // Depth and coverage of the rows' pixels.
-                float row_depth[ROWS_MAX][LANES];
-                unsigned covered[ROWS_MAX];
-                for (int y = 0; y <= rows; ++y) {
-                    const I inside = (ea > out_a) & (eb > out_b) & (ec > out_c) & within;
-                    const F depth = (__builtin_convertvector(ea, F) * key_a + __builtin_convertvector(eb, F) * key_b
-                        + __builtin_convertvector(ec, F) * key_c) * inv;
-                    store(row_depth[y], depth);
-                    covered[y] = marks(inside);
-                    ea += row_a;
-                    eb += row_b;
-                    ec += row_c;
-                }
-                // A triangle covers one run of a row: whole vectors from its first pixel on, one over the end of the other.
-                for (int y = 0; y <= rows; ++y) {
-                    const int skipped = __builtin_ctz(covered[y] | 1u << LANES), length = __builtin_popcount(covered[y]);
-                    const int cell = field[CELL][l] + y * width + x + skipped;
-                    istore(cells + listed, cell + lanes());
-                    istore(owners + listed, I(owner));
-                    store(depths + listed, load(row_depth[y] + skipped));
-                    __builtin_prefetch(keys + cell);
-                    if (rays) {
-                        __builtin_prefetch(ray_of + 8 * cell);
-                        __builtin_prefetch(ray_of + 8 * (cell + length - 1));
-                    }
-                    listed += length;
-                }
-                if (listed >= LISTED) flush();
-            }
-        }
     }
-    flush();
     return others;
 """,
         "return 0;",
@@ -431,13 +283,9 @@ def draw_block(
     survivors: wp.array(dtype=int),
     begin: int,
     count: int,
-    points: wp.array(dtype=wp.vec3),
-    plane_triangles: wp.array(dtype=wp.vec3i),
     row_first: int,
     row_end: int,
     guard: float,
-    ray_along_min: float,
-    ray_trust: float,
     tiles: wp.array(dtype=wp.uint64),
 ) -> wp.uint64:
     """Draw those of `count` survivors that are small; a bit for each of the others."""
@@ -479,93 +327,61 @@ def draw_block(
     const int bias_c = edge_bias(I(dxc), I(dyc))[0];
     const float inv_area = 1.0f / (float)area;
     const int low = ~triangle;
-    if (in_rows) {
-        const int x_first = left - target.x0, x_last = right - target.x0;
-        const int y_first = top - target.y0, y_last = bottom - target.y0;
-        // Steps are multiples of 256, so that the sign of an edge function is that of its whole part in those: within a tile
-        // that the edge crosses it has 32 bits, and elsewhere any number as large has its sign.
-        auto coarse = [](long long e) -> int {
-            e >>= 8;
-            return e > (1 << 30) ? 1 << 30 : e < -(1 << 30) ? -(1 << 30) : (int)e;
-        };
-        auto over = [](int dx, int dy) -> long long {
-            return (dx > 0 ? 256LL * (TILE_ROWS - 1) * dx : 0) - (dy < 0 ? 256LL * (LANES - 1) * dy : 0);
-        };
-        const long long over_a = over(dxa, dya), over_b = over(dxb, dyb), over_c = over(dxc, dyc);
-        const I across_a = places * dya, across_b = places * dyb, across_c = places * dyc;
-        const D wide = __builtin_convertvector(places, D);
-        const D wide_a = wide * (dya * 256.0), wide_b = wide * (dyb * 256.0), wide_c = wide * (dyc * 256.0);
-        const double over_area = 1.0 / (double)area;
-        const double x_slope = -256.0 * ((double)dya * ka + (double)dyb * kb + (double)dyc * kc) * over_area;
-        const double y_slope = 256.0 * ((double)dxa * ka + (double)dxb * kb + (double)dxc * kc) * over_area;
-        // With what the slopes lose where a sliver's terms cancel.
-        auto magnitude = [&](double a, double b, double c) -> double {
-            return (__builtin_fabs(a) * ka + __builtin_fabs(b) * kb + __builtin_fabs(c) * kc) * over_area * 1.0e-14;
-        };
-        const double rise = (x_slope > 0.0 ? x_slope * (LANES - 1) : 0.0) + (y_slope > 0.0 ? y_slope * (TILE_ROWS - 1) : 0.0)
-            + 256.0 * (LANES * magnitude(dya, dyb, dyc) + TILE_ROWS * magnitude(dxa, dxb, dxc));
-        const float most_key = ka > kb ? (ka > kc ? ka : kc) : (kb > kc ? kb : kc);
-        for (int y_tile = y_first & -TILE_ROWS; y_tile <= y_last; y_tile += TILE_ROWS) {
-            const int y = y_tile > y_first ? y_tile : y_first;
-            const int count = (y_tile + TILE_ROWS <= y_last ? y_tile + TILE_ROWS : y_last + 1) - y;
-            for (int x = x_first & -LANES; x <= x_last; x += LANES) {
-                const int x_begin = x + LANES <= width ? x : width - LANES;
-                const long long right_of = 256LL * (x_begin - x_first), under = 256LL * (y - y_first);
-                const long long ea = ea0 + under * dxa - right_of * dya, eb = eb0 + under * dxb - right_of * dyb;
-                const long long ec = ec0 + under * dxc - right_of * dyc;
-                if (((ea + bias_a + over_a) | (eb + bias_b + over_b) | (ec + bias_c + over_c)) < 0) continue;
-                Tile& tile = tile_of[y_tile / TILE_ROWS * tile_columns + x / LANES];
-                const double nearest = ((double)ea * ka + (double)eb * kb + (double)ec * kc) * over_area
-                    + magnitude(ea, eb, ec) + rise;
-                if (above((float)(nearest < most_key ? nearest : most_key)) < tile.known) continue;
-                F found = F(__builtin_inff());
-                auto depth_of = [&](int row, I, I, I, I inside) __attribute__((always_inline)) -> F {
-                    const double down = 256.0 * row;
-                    const F a = __builtin_convertvector((double)ea + down * dxa - wide_a, F);
-                    const F b = __builtin_convertvector((double)eb + down * dxb - wide_b, F);
-                    const F c = __builtin_convertvector((double)ec + down * dxc - wide_c, F);
-                    const F depth = (a * ka + b * kb + c * kc) * inv_area;
-                    found = pick(inside & (depth < found), depth, found);
-                    return depth;
-                };
-                const unsigned long long covered = draw_rows(x_begin, y, count, coarse(ea + bias_a) - across_a,
-                    coarse(eb + bias_b) - across_b, coarse(ec + bias_c) - across_c, I(dxa), I(dxb), I(dxc),
-                    U((unsigned)low), depth_of);
-                float least = found[0];
-                EACH_LANE least = found[l] < least ? found[l] : least;
-                cover(tile, y_tile, covered << LANES * (y - y_tile), least);
-            }
+    const int x_first = left - target.x0, x_last = right - target.x0;
+    const int y_first = top - target.y0, y_last = bottom - target.y0;
+    // Steps are multiples of 256, so that the sign of an edge function is that of its whole part in those: within a tile
+    // that the edge crosses it has 32 bits, and elsewhere any number as large has its sign.
+    auto coarse = [](long long e) -> int {
+        e >>= 8;
+        return e > (1 << 30) ? 1 << 30 : e < -(1 << 30) ? -(1 << 30) : (int)e;
+    };
+    auto over = [](int dx, int dy) -> long long {
+        return (dx > 0 ? 256LL * (TILE_ROWS - 1) * dx : 0) - (dy < 0 ? 256LL * (LANES - 1) * dy : 0);
+    };
+    const long long over_a = over(dxa, dya), over_b = over(dxb, dyb), over_c = over(dxc, dyc);
+    const I across_a = places * dya, across_b = places * dyb, across_c = places * dyc;
+    const D wide = __builtin_convertvector(places, D);
+    const D wide_a = wide * (dya * 256.0), wide_b = wide * (dyb * 256.0), wide_c = wide * (dyc * 256.0);
+    const double over_area = 1.0 / (double)area;
+    const double x_slope = -256.0 * ((double)dya * ka + (double)dyb * kb + (double)dyc * kc) * over_area;
+    const double y_slope = 256.0 * ((double)dxa * ka + (double)dxb * kb + (double)dxc * kc) * over_area;
+    // With what the slopes lose where a sliver's terms cancel.
+    auto magnitude = [&](double a, double b, double c) -> double {
+        return (__builtin_fabs(a) * ka + __builtin_fabs(b) * kb + __builtin_fabs(c) * kc) * over_area * 1.0e-14;
+    };
+    const double rise = (x_slope > 0.0 ? x_slope * (LANES - 1) : 0.0) + (y_slope > 0.0 ? y_slope * (TILE_ROWS - 1) : 0.0)
+        + 256.0 * (LANES * magnitude(dya, dyb, dyc) + TILE_ROWS * magnitude(dxa, dxb, dxc));
+    const float most_key = ka > kb ? (ka > kc ? ka : kc) : (kb > kc ? kb : kc);
+    for (int y_tile = y_first & -TILE_ROWS; y_tile <= y_last; y_tile += TILE_ROWS) {
+        const int y = y_tile > y_first ? y_tile : y_first;
+        const int count = (y_tile + TILE_ROWS <= y_last ? y_tile + TILE_ROWS : y_last + 1) - y;
+        for (int x = x_first & -LANES; x <= x_last; x += LANES) {
+            const int x_begin = x + LANES <= width ? x : width - LANES;
+            const long long right_of = 256LL * (x_begin - x_first), under = 256LL * (y - y_first);
+            const long long ea = ea0 + under * dxa - right_of * dya, eb = eb0 + under * dxb - right_of * dyb;
+            const long long ec = ec0 + under * dxc - right_of * dyc;
+            if (((ea + bias_a + over_a) | (eb + bias_b + over_b) | (ec + bias_c + over_c)) < 0) continue;
+            Tile& tile = tile_of[y_tile / TILE_ROWS * tile_columns + x / LANES];
+            const double nearest = ((double)ea * ka + (double)eb * kb + (double)ec * kc) * over_area
+                + magnitude(ea, eb, ec) + rise;
+            if (above((float)(nearest < most_key ? nearest : most_key)) < tile.known) continue;
+            F found = F(__builtin_inff());
+            auto depth_of = [&](int row, I, I, I, I inside) __attribute__((always_inline)) -> F {
+                const double down = 256.0 * row;
+                const F a = __builtin_convertvector((double)ea + down * dxa - wide_a, F);
+                const F b = __builtin_convertvector((double)eb + down * dxb - wide_b, F);
+                const F c = __builtin_convertvector((double)ec + down * dxc - wide_c, F);
+                const F depth = (a * ka + b * kb + c * kc) * inv_area;
+                found = pick(inside & (depth < found), depth, found);
+                return depth;
+            };
+            const unsigned long long covered = draw_rows(x_begin, y, count, coarse(ea + bias_a) - across_a,
+                coarse(eb + bias_b) - across_b, coarse(ec + bias_c) - across_c, I(dxa), I(dxb), I(dxc),
+                U((unsigned)low), depth_of);
+            float least = found[0];
+            EACH_LANE least = found[l] < least ? found[l] : least;
+            cover(tile, y_tile, covered << LANES * (y - y_tile), least);
         }
-        return;
-    }
-    const V n = spread(plane.n);
-    const F offset = F(plane.offset);
-    typedef decltype(D() < D()) Wide;
-    const D lane = __builtin_convertvector(lanes(), D);
-    const double xstep_a = dya * 256.0, xstep_b = dyb * 256.0, xstep_c = dyc * 256.0;
-    const double ystep_a = dxa * 256.0, ystep_b = dxb * 256.0, ystep_c = dxc * 256.0;
-    D ea_row = (double)ea0 - lane * xstep_a, eb_row = (double)eb0 - lane * xstep_b, ec_row = (double)ec0 - lane * xstep_c;
-    for (int y = top; y <= bottom; ++y) {
-        D ea = ea_row, eb = eb_row, ec = ec_row;
-        const int cell = (y - target.y0) * width - target.x0;
-        for (int x = left; x <= right; x += LANES) {
-            const Wide within = (ea + (double)bias_a >= 0.0) & (eb + (double)bias_b >= 0.0) & (ec + (double)bias_c >= 0.0);
-            const I column = x + lanes();
-            I inside = __builtin_convertvector(within, I) & (column <= right);
-            if (bits(inside)) {
-                const F depth = (__builtin_convertvector(ea, F) * ka + __builtin_convertvector(eb, F) * kb
-                    + __builtin_convertvector(ec, F) * kc) * inv_area;
-                const I inner = column < target.x1 ? column : I(target.x1 - 1);
-                if (masked) inside &= igather(target.mask.data, y * target.mask_width + inner) == target.mask_value;
-                put(inside, cell + inner, depth, n, offset, I(0), &low);
-            }
-            ea -= xstep_a * LANES;
-            eb -= xstep_b * LANES;
-            ec -= xstep_c * LANES;
-        }
-        ea_row += ystep_a;
-        eb_row += ystep_b;
-        ec_row += ystep_c;
     }
 """
     )
@@ -575,12 +391,9 @@ def draw_large(
     a: wp.vec3,
     b: wp.vec3,
     c: wp.vec3,
-    plane: PlaneView,
     triangle: int,
     row_first: int,
     row_end: int,
-    ray_along_min: float,
-    ray_trust: float,
     tiles: wp.array(dtype=wp.uint64),
 ): ...
 
@@ -596,13 +409,14 @@ def draw_blocks_kernel(
     step: int,
     survivors: wp.array(dtype=int),
     survivor_count: wp.array(dtype=int),
-    points: wp.array(dtype=wp.vec3),
-    plane_triangles: wp.array(dtype=wp.vec3i),
     tiles: wp.array(dtype=wp.uint64),
     row_first: int,
     row_end: int,
 ):
-    """As `raster.draw_kernel`, one thread per block of a slice's survivors: slices begin at multiples of `BLOCK`."""
+    """As `raster.draw_kernel` into a target without rays, one thread per block of a slice's survivors.
+
+    Slices begin at multiples of `BLOCK`; the target is `WIDTH_MIN` pixels wide or more.
+    """
     begin = (first + wp.tid()) * BLOCK
     part = begin / step
     count = wp.min(part * step + survivor_count[part] - begin, BLOCK)
@@ -615,13 +429,9 @@ def draw_blocks_kernel(
         survivors,
         begin,
         count,
-        points,
-        plane_triangles,
         row_first,
         row_end,
         GUARD,
-        RAY_ALONG_MIN,
-        RAY_TRUST,
         tiles,
     )
     i = begin
@@ -635,28 +445,22 @@ def draw_blocks_kernel(
             triangle = t + id_offset
             if ids.shape[0] > 0:
                 triangle = ids[t]
-            plane = PlaneView()
-            if target.ray.shape[0] > 0:
-                plane = triangle_plane(points, plane_triangles[t])
             if target.painter != 0:
                 middle = (a[2] + b[2] + c[2]) / 3.0
                 a = at_depth(a, middle)
                 b = at_depth(b, middle)
                 c = at_depth(c, middle)
             if needs_clipping(a) or needs_clipping(b) or needs_clipping(c):
-                draw_clipped(target, a, b, c, plane, triangle, row_first, row_end)
+                draw_clipped(target, a, b, c, PlaneView(), triangle, row_first, row_end)
             else:
                 draw_large(
                     target,
                     wp.vec3(a[0], a[1], a[2]),
                     wp.vec3(b[0], b[1], b[2]),
                     wp.vec3(c[0], c[1], c[2]),
-                    plane,
                     triangle,
                     row_first,
                     row_end,
-                    RAY_ALONG_MIN,
-                    RAY_TRUST,
                     tiles,
                 )
         left = left >> wp.uint64(1)
@@ -692,64 +496,3 @@ def resolve_blocks_kernel(
 ):
     """As `raster.resolve_kernel`, one thread per block of pixels."""
     resolve_block((first + wp.tid()) * BLOCK, key, out_triangle, out_depth_key)
-
-
-@wp.func_native(
-    vector.snippet(r"""
-    const int end = begin + BLOCK < pixel.shape[0] ? begin + BLOCK : pixel.shape[0];
-    const float* points = (const float*)point.data;
-    const float* directions = (const float*)direction.data;
-    const V eye = spread(camera.eye), forward = spread(camera.forward);
-    for (int start = begin; start < end; start += LANES) {
-        const bool full = start + LANES <= end;
-        const int count = full ? LANES : end - start;
-        const I own = full ? start + lanes() : ipick(lanes() < count, start + lanes(), I(start));
-        const V p = vrows(points, start, full, own), d = vrows(directions, start, full, own);
-        const V to_eye = sub(p, eye);
-        const F distance = __builtin_elementwise_sqrt(dot(to_eye, to_eye));
-        const F unit_depth = distance / fmax(dot(forward, to_eye), F(1.0e-30f));
-        // Turned as they lie: eight numbers of a ray side by side.
-        float columns[8 * LANES];
-        const F column[8] = {p.x, p.y, p.z, distance, d.x, d.y, d.z, unit_depth};
-        for (int half = 0; half < LANES / 8; ++half) {
-            _Pragma("clang loop unroll(full)") for (int k = 0; k < 8; ++k) store(columns + LANES * k, column[k]);
-            int at[8];
-            for (int k = 0; k < 8; ++k) at[k] = LANES * k + 8 * half;
-            Row rows[8];
-            transposed(columns, at, rows);
-            for (int k = 0; k < 8 && 8 * half + k < count; ++k) {
-                const int i = pixel.data[start + 8 * half + k], row = i / camera.width;
-                const int cell = (row - y0) * box_width + i - row * camera.width - x0;
-                __builtin_memcpy((float*)out_ray.data + 8 * cell, &rows[k], sizeof(Row));
-            }
-        }
-    }
-""")
-)
-def ray_block(
-    begin: int,
-    camera: CameraView,
-    pixel: wp.array(dtype=int),
-    point: wp.array(dtype=wp.vec3),
-    direction: wp.array(dtype=wp.vec3),
-    x0: int,
-    y0: int,
-    box_width: int,
-    out_ray: wp.array(dtype=wp.vec4),
-): ...
-
-
-@wp.kernel(module=RAYS)
-def ray_blocks_kernel(
-    first: int,
-    camera: CameraView,
-    pixel: wp.array(dtype=int),
-    point: wp.array(dtype=wp.vec3),
-    direction: wp.array(dtype=wp.vec3),
-    x0: int,
-    y0: int,
-    box_width: int,
-    out_ray: wp.array(dtype=wp.vec4),
-):
-    """As `raster.ray_image_kernel`, one thread per block of mirror pixels."""
-    ray_block((first + wp.tid()) * BLOCK, camera, pixel, point, direction, x0, y0, box_width, out_ray)

@@ -1,0 +1,543 @@
+"""`raster.draw_kernel` where rays tell the depth, with triangles and fragments side by side: the same picture, bit for bit.
+
+Virtual meshes have more triangles than their pictures have pixels, most of them slivers or smaller than a pixel: what such a
+triangle costs is what it costs to find out that it covers nothing. So nothing is culled beforehand and read again. Triangles
+of a block are read as they lie, set up in vectors, and their rows are walked side by side: edges are divided by their slopes
+for the columns between them, in float32, a little too wide. What lies between is listed; a list's vectors are full however few
+pixels a triangle has. Whether a fragment is inside is told by its exact edge functions when it is worked on, and what it needs
+of memory has been asked for by then.
+
+Triangles beyond a box of 64 pixels are drawn one at a time in float64, whose 53 bits hold everything below 2^46; within it
+edge functions are exact in 32 bits (products below 2^29, sums of two below 2^30). What has to be clipped goes to the plain
+kernel's functions.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from warp_reflect import vector
+from warp_reflect.layers import CameraView
+from warp_reflect.raster import (
+    GUARD,
+    RAY_ALONG_MIN,
+    RAY_TRUST,
+    PlaneView,
+    TargetView,
+    at_depth,
+    draw_clipped,
+    needs_clipping,
+    triangle_plane,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+BLOCK = wp.constant(vector.BLOCK)
+
+# What both snippets begin with.
+_TARGET = r"""
+    auto snap = [](F x) -> I { return __builtin_convertvector(__builtin_elementwise_floor(x * 256.0f + 0.5f), I); };
+    // raster.edge_bias
+    auto edge_bias = [](I dx, I dy) -> I { return ((dy < 0) | ((dy == 0) & (dx > 0))) ? I(0) : I(-1); };
+    const int width = target.x1 - target.x0;
+    const float* ray_of = (const float*)target.ray.data;
+    unsigned long long* keys = (unsigned long long*)target.key.data;
+    const F key_min = F(target.key_min);
+
+    // Fragments of interpolated keys at cells, of triangles with these planes and, by owner, complements of their numbers:
+    // raster.ray_key. A masked target has no rays outside its mask.
+    auto put = [&](I inside, I cell, F depth, V n, F offset, I owner, const int* low_of) {
+        inside &= depth > key_min;
+        F now;
+        EACH_LANE now[l] = __builtin_bit_cast(float, (unsigned)(keys[cell[l]] >> 32));
+        F ray[8];
+        gather8(ray_of, 8 * cell, ray);
+        const V o = V{ray[0], ray[1], ray[2]}, d = V{ray[4], ray[5], ray[6]};
+        const F o_w = ray[3], d_w = ray[7];
+        const F path = d_w / depth;
+        const F along = n.x * d.x + n.y * d.y + n.z * d.z;
+        const F height = offset - n.x * o.x - n.y * o.y - n.z * o.z;
+        const F linear = path - o_w;
+        const F t = height / along;
+        const I trusted = (__builtin_elementwise_abs(along) > ray_along_min)
+            & (__builtin_elementwise_abs(t - linear) < ray_trust * path);
+        const F total = o_w + pick(trusted, fmax(t, F(0.0f)), linear);
+        depth = 1.0f / fmax(total, F(1.0e-30f));
+        inside &= d_w > 0.0f;
+        float depths[LANES];
+        int cells[LANES], owners[LANES];
+        store(depths, depth);
+        istore(cells, cell);
+        istore(owners, owner);
+        for (unsigned left = bits(inside & (depth >= now)); left != 0; left &= left - 1) {
+            const int l = __builtin_ctz(left);
+            const unsigned high = __builtin_bit_cast(unsigned, depths[l]);
+            const unsigned long long key = ((unsigned long long)high << 32) | (unsigned)low_of[owners[l]];
+            if (key > keys[cells[l]]) keys[cells[l]] = key;
+        }
+    };
+"""
+
+
+@wp.func_native(
+    vector.snippet(
+        _TARGET
+        + r"""
+    constexpr int LISTED = 256;  // fragments that are worked on together
+    constexpr int SIDE = 65;  // the most pixels that a box of 64 pixels has side by side
+    auto least = [](I p, I q) -> I { return p < q ? p : q; };
+    auto most = [](I p, I q) -> I { return p > q ? p : q; };
+    auto whole = [](F x) -> I { return __builtin_convertvector(x, I); };
+    auto apart = [](V a, F s) -> V { return V{a.x / s, a.y / s, a.z / s}; };
+    // The first three of four floats at p[4 * index[l]].
+    auto gather4 = [](const float* p, I index) -> V {
+        typedef float Four __attribute__((ext_vector_type(4)));
+        V v;
+        _Pragma("clang loop unroll(full)") for (int part = 0; part < LANES; part += 8) {
+            Four r[8];
+            Row s[4];
+            _Pragma("clang loop unroll(full)") for (int l = 0; l < 8; ++l)
+                __builtin_memcpy(&r[l], p + 4 * index[part + l], sizeof(Four));
+            _Pragma("clang loop unroll(full)") for (int l = 0; l < 4; ++l)
+                s[l] = __builtin_shufflevector(r[l], r[l + 4], 0, 1, 2, 3, 4, 5, 6, 7);
+            const Row xy = __builtin_shufflevector(s[0], s[1], 0, 1, 8, 9, 4, 5, 12, 13);
+            const Row XY = __builtin_shufflevector(s[2], s[3], 0, 1, 8, 9, 4, 5, 12, 13);
+            const Row zw = __builtin_shufflevector(s[0], s[1], 2, 3, 10, 11, 6, 7, 14, 15);
+            const Row ZW = __builtin_shufflevector(s[2], s[3], 2, 3, 10, 11, 6, 7, 14, 15);
+            const Row x = __builtin_shufflevector(xy, XY, 0, 2, 8, 10, 4, 6, 12, 14);
+            const Row y = __builtin_shufflevector(xy, XY, 1, 3, 9, 11, 5, 7, 13, 15);
+            const Row z = __builtin_shufflevector(zw, ZW, 0, 2, 8, 10, 4, 6, 12, 14);
+            __builtin_memcpy((float*)&v.x + part, &x, sizeof(Row));
+            __builtin_memcpy((float*)&v.y + part, &y, sizeof(Row));
+            __builtin_memcpy((float*)&v.z + part, &z, sizeof(Row));
+        }
+        return v;
+    };
+    const float* corner_of = (const float*)triangles.data;
+    const float* plane_corner_of = (const float*)plane_triangles.data;
+    const float* point_of = (const float*)points.data;
+    const float* screen_of = (const float*)screen.data;
+    const int row0 = target.y0 > row_first ? target.y0 : row_first;
+    const int row1 = target.y1 < row_end ? target.y1 : row_end;
+    const int end = begin + BLOCK < triangles.shape[0] ? begin + BLOCK : triangles.shape[0];
+
+    // Of a triangle: edges opposite to a and b at its first pixel, their steps from pixel to pixel and from row to row, its
+    // area and first cell; the depth keys of a, b, c and which of the edges own no centre on them; its plane. And the
+    // complement of its number.
+    enum { EA, EB, STEP_A, ROW_A, STEP_B, ROW_B, AREA, CELL, KEY_A, KEY_B, KEY_C, OPEN, NX, NY, NZ, OFFSET };
+    constexpr int FIELDS = 16;
+    float record[BLOCK * FIELDS];
+    int low_of[BLOCK];
+    // Fragments: owner, row and column from the triangle's first pixel.
+    int list[LISTED + SIDE * LANES + SIDE + 2 * LANES];
+    int listed = 0;
+    auto flush = [&]() {
+        for (int start = 0; start < listed; start += LANES) {
+            const I valid = start + lanes() < listed;
+            const I fragment = ipick(valid, iload(list + start), I(list[start]));
+            const I owner = fragment >> 16, row = (fragment >> 8) & 255, column = fragment & 255;
+            F one[8], other[8];
+            gather8(record, FIELDS * owner, one);
+            gather8(record, FIELDS * owner + 8, other);
+            auto number = [](F x) -> I { return __builtin_bit_cast(I, x); };
+            const I ea = number(one[EA]) + row * number(one[ROW_A]) - column * number(one[STEP_A]);
+            const I eb = number(one[EB]) + row * number(one[ROW_B]) - column * number(one[STEP_B]);
+            const I area = number(one[AREA]);
+            const I ec = area - ea - eb;
+            const I open = number(other[OPEN - 8]);
+            const I inside = valid & (((ea - (open & 1)) | (eb - (open >> 1 & 1)) | (ec - (open >> 2))) >= 0);
+            const F depth = (__builtin_convertvector(ea, F) * other[KEY_A - 8] + __builtin_convertvector(eb, F) * other[KEY_B - 8]
+                + __builtin_convertvector(ec, F) * other[KEY_C - 8]) * (1.0f / __builtin_convertvector(area, F));
+            put(inside, number(one[CELL]) + row * width + column, depth, V{other[NX - 8], other[NY - 8], other[NZ - 8]},
+                other[OFFSET - 8], owner, low_of);
+        }
+        listed = 0;
+    };
+
+    unsigned long long others = 0;
+    int survivors = 0;
+    for (int start = begin; start < end; start += LANES) {
+        const bool full = start + LANES <= end;
+        const I valid = full ? I(-1) : start + lanes() < end;
+        const I t = ipick(valid, start + lanes(), I(start));
+        const V corners_as_floats = vrows(corner_of, start, full, t);
+        const I corner[3] = {__builtin_bit_cast(I, corners_as_floats.x), __builtin_bit_cast(I, corners_as_floats.y),
+            __builtin_bit_cast(I, corners_as_floats.z)};
+        V v[3];
+        _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each) v[each] = gather4(screen_of, corner[each]);
+        F k[3] = {v[0].z, v[1].z, v[2].z};
+        // Dropped vertices, and those that are not a number.
+        const I kept = valid & (k[0] >= 0.0f) & (k[1] >= 0.0f) & (k[2] >= 0.0f);
+        if (!bits(kept)) continue;
+        I clipped = I(0);
+        _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each)
+            clipped |= (k[each] == 0.0f) | (__builtin_elementwise_abs(v[each].x) > guard)
+                | (__builtin_elementwise_abs(v[each].y) > guard);
+        clipped &= kept;
+        if (target.painter != 0) {
+            const F middle = (k[0] + k[1] + k[2]) / 3.0f;
+            _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each)
+                k[each] = pick(k[each] > 0.0f, middle, k[each]);
+        }
+        // What is no finite number snaps to no pixel.
+        const I finite = (v[0].x + v[1].x + v[2].x + v[0].y + v[1].y + v[2].y + k[0] + k[1] + k[2]) * 0.0f == 0.0f;
+        const I sound = kept & finite & ~clipped;
+        I sx[3], sy[3];
+        _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each) {
+            sx[each] = snap(pick(sound, v[each].x, F(0.0f)));
+            sy[each] = snap(pick(sound, v[each].y, F(0.0f)));
+        }
+        const I low_x = least(sx[0], least(sx[1], sx[2])), high_x = most(sx[0], most(sx[1], sx[2]));
+        const I low_y = least(sy[0], least(sy[1], sy[2])), high_y = most(sy[0], most(sy[1], sy[2]));
+        const I left = most((low_x + 127) >> 8, I(target.x0)), right = least((high_x - 128) >> 8, I(target.x1 - 1));
+        const I upper = most((low_y + 127) >> 8, I(target.y0)), lower = least((high_y - 128) >> 8, I(target.y1 - 1));
+        const I surviving = sound & (left <= right) & (upper <= lower);
+        unsigned cut = bits(clipped);
+        for (unsigned left_over = cut; left_over != 0; left_over &= left_over - 1) {
+            const int l = __builtin_ctz(left_over);
+            bool before = true;
+            for (int each = 0; each < 3; ++each) before &= screen_of[4 * corner[each][l] + 3] < target.near;
+            if (before) cut &= ~(1u << l);
+        }
+        survivors += __builtin_popcount(bits(surviving)) + __builtin_popcount(cut);
+        const I top = most(upper, I(row0)), bottom = least(lower, I(row1 - 1));
+        const I seen = surviving & (top <= bottom);
+        const I small = (high_x - low_x <= 64 * 256) & (high_y - low_y <= 64 * 256);
+        others |= (unsigned long long)(cut | bits(seen & ~small)) << (start - begin);
+        I drawn = seen & small;
+        if (!bits(drawn)) continue;
+        // Of what is not drawn here products would not fit.
+        const I xa = ipick(drawn, sx[0], I(0)), ya = ipick(drawn, sy[0], I(0));
+        I xb = ipick(drawn, sx[1], I(0)), yb = ipick(drawn, sy[1], I(0));
+        I xc = ipick(drawn, sx[2], I(0)), yc = ipick(drawn, sy[2], I(0));
+        I area = (xb - xa) * (yc - ya) - (yb - ya) * (xc - xa);
+        drawn &= area != 0;
+        const I turned = area < 0;
+        area = ipick(turned, -area, area);
+        const I x_b = xb, y_b = yb;
+        xb = ipick(turned, xc, xb); yb = ipick(turned, yc, yb);
+        xc = ipick(turned, x_b, xc); yc = ipick(turned, y_b, yc);
+        const I dx[3] = {xc - xb, xa - xc, xb - xa}, dy[3] = {yc - yb, ya - yc, yb - ya};
+        const I px = ipick(drawn, left * 256 + 128, I(0)), py = ipick(drawn, top * 256 + 128, I(0));
+        const I e[3] = {dx[0] * (py - yb) - dy[0] * (px - xb), dx[1] * (py - yc) - dy[1] * (px - xc),
+            dx[2] * (py - ya) - dy[2] * (px - xa)};
+        const I columns = right - left, rows = ipick(drawn, bottom - top, I(-1));
+        const I cell = (top - target.y0) * width + left - target.x0;
+        const int own = start - begin;
+        istore(low_of + own, ~(ids.shape[0] > 0 ? igather(ids.data, t) : t + id_offset));
+        // Columns from `edge / step` on, or up to there. Half of a 1/65536 pixel off, no quotient is 0 by 0.
+        F inverse[3];
+        I is_left[3], at_row[3], down[3];
+        I open = I(0);
+        _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each) {
+            const I bias = edge_bias(dx[each], dy[each]);
+            open -= bias * (1 << each);
+            is_left[each] = dy[each] < 0;
+            inverse[each] = pick(dy[each] == 0, F(1.0e30f), 1.0f / __builtin_convertvector(dy[each] * 256, F));
+            at_row[each] = e[each] + bias;
+            down[each] = dx[each] * 256;
+        }
+        // raster.triangle_plane
+        V p[3];
+        I plane_corner[3] = {corner[0], corner[1], corner[2]};
+        if (plane_corner_of != corner_of) {
+            const V read = vrows(plane_corner_of, start, full, t);
+            plane_corner[0] = __builtin_bit_cast(I, read.x);
+            plane_corner[1] = __builtin_bit_cast(I, read.y);
+            plane_corner[2] = __builtin_bit_cast(I, read.z);
+        }
+        _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each) p[each] = vgather(point_of, plane_corner[each]);
+        const V n = cross(sub(p[1], p[0]), sub(p[2], p[0]));
+        const F square = dot(n, n);
+        const I safe = (square > 1.0e-24f) & (square < 1.0e24f);
+        V plane = times(1.0f / __builtin_elementwise_sqrt(square), n);
+        if (bits(~safe)) {
+            const V s = apart(n, size(n));
+            plane = vpick(safe, plane, vpick(size(n) == 0.0f, same(0.0f), apart(s, __builtin_elementwise_sqrt(dot(s, s)))));
+        }
+        {
+            float columns_of[FIELDS * LANES];
+            auto keep = [&](int field, I value) { istore((int*)columns_of + LANES * field, value); };
+            auto keep_float = [&](int field, F value) { store(columns_of + LANES * field, value); };
+            keep(EA, e[0]); keep(EB, e[1]);
+            keep(STEP_A, dy[0] * 256); keep(ROW_A, down[0]);
+            keep(STEP_B, dy[1] * 256); keep(ROW_B, down[1]);
+            keep(AREA, area); keep(CELL, cell);
+            keep_float(KEY_A, k[0]); keep_float(KEY_B, pick(turned, k[2], k[1])); keep_float(KEY_C, pick(turned, k[1], k[2]));
+            keep(OPEN, open);
+            keep_float(NX, plane.x); keep_float(NY, plane.y); keep_float(NZ, plane.z); keep_float(OFFSET, dot(plane, p[0]));
+            _Pragma("clang loop unroll(full)") for (int part = 0; part < LANES; part += 8)
+                _Pragma("clang loop unroll(full)") for (int half = 0; half < FIELDS; half += 8) {
+                    int at[8];
+                    for (int field = 0; field < 8; ++field) at[field] = LANES * (half + field) + part;
+                    Row turned_rows[8];
+                    transposed(columns_of, at, turned_rows);
+                    for (int l = 0; l < 8; ++l)
+                        __builtin_memcpy(record + FIELDS * (own + part + l) + half, &turned_rows[l], sizeof(Row));
+                }
+        }
+        const F last = __builtin_convertvector(columns, F);
+        int cells[LANES], first_of[LANES], length_of[LANES];
+        istore(cells, cell);
+        int row_count = 0;
+        EACH_LANE row_count = rows[l] >= row_count ? rows[l] + 1 : row_count;
+        for (int y = 0; y < row_count; ++y) {
+            F from = F(0.0f), to = last;
+            _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each) {
+                const F bound = (__builtin_convertvector(at_row[each], F) + 0.5f) * inverse[each];
+                from = pick(is_left[each], fmax(from, bound), from);
+                to = pick(is_left[each], to, fmin(to, bound));
+                at_row[each] += down[each];
+            }
+            // Quotients up to 64 are rounded by less than 2e-5.
+            from = __builtin_elementwise_ceil(from - 1.0e-4f);
+            to = __builtin_elementwise_floor(to + 1.0e-4f);
+            unsigned some = bits((from <= to) & (y <= rows));
+            if (some == 0) continue;
+            istore(first_of, whole(from));
+            istore(length_of, whole(to - from) + 1);
+            for (; some != 0; some &= some - 1) {
+                const int l = __builtin_ctz(some);
+                const int x = first_of[l], length = length_of[l];
+                const int at = cells[l] + y * width + x;
+                __builtin_prefetch(keys + at);
+                __builtin_prefetch(ray_of + 8 * at);
+                __builtin_prefetch(ray_of + 8 * (at + length - 1));
+                const int fragment = (own + l) << 16 | y << 8 | x;
+                for (int part = 0; part < length; part += LANES) istore(list + listed + part, fragment + part + lanes());
+                listed += length;
+            }
+            if (listed >= LISTED) flush();
+        }
+    }
+    flush();
+    if (row0 == target.y0) out_survivor_count.data[0] += survivors;
+    return others;
+""",
+        "return 0;",
+    )
+)
+def draw_block(
+    target: TargetView,
+    screen: wp.array(dtype=wp.vec4),
+    triangles: wp.array(dtype=wp.vec3i),
+    ids: wp.array(dtype=int),
+    id_offset: int,
+    begin: int,
+    points: wp.array(dtype=wp.vec3),
+    plane_triangles: wp.array(dtype=wp.vec3i),
+    row_first: int,
+    row_end: int,
+    guard: float,
+    ray_along_min: float,
+    ray_trust: float,
+    out_survivor_count: wp.array(dtype=int),
+) -> wp.uint64:
+    """Draw those triangles of a block that are small; a bit for each of the others. The first band counts what has a pixel."""
+    ...
+
+
+@wp.func_native(
+    vector.snippet(
+        _TARGET
+        + r"""
+    typedef double D __attribute__((ext_vector_type(LANES)));
+    typedef decltype(D() < D()) Wide;
+    auto least = [](int p, int q) -> int { return p < q ? p : q; };
+    auto most = [](int p, int q) -> int { return p > q ? p : q; };
+    const int xa = snap(F(a[0]))[0], ya = snap(F(a[1]))[0];
+    int xb = snap(F(b[0]))[0], yb = snap(F(b[1]))[0], xc = snap(F(c[0]))[0], yc = snap(F(c[1]))[0];
+    float kb = b[2], kc = c[2];
+    long long area = (long long)(xb - xa) * (yc - ya) - (long long)(yb - ya) * (xc - xa);
+    if (area == 0) return;
+    if (area < 0) {
+        area = -area;
+        const int x = xb, y = yb;
+        const float k = kb;
+        xb = xc; yb = yc; kb = kc;
+        xc = x; yc = y; kc = k;
+    }
+    const int low_x = least(xa, least(xb, xc)), high_x = most(xa, most(xb, xc));
+    const int low_y = least(ya, least(yb, yc)), high_y = most(ya, most(yb, yc));
+    const int left = most((low_x + 127) >> 8, target.x0), right = least((high_x - 128) >> 8, target.x1 - 1);
+    const int top = most((low_y + 127) >> 8, most(target.y0, row_first));
+    const int bottom = least((high_y - 128) >> 8, least(target.y1, row_end) - 1);
+    if (left > right || top > bottom) return;
+    const int dxa = xc - xb, dya = yc - yb, dxb = xa - xc, dyb = ya - yc, dxc = xb - xa, dyc = yb - ya;
+    const int px = left * 256 + 128, py = top * 256 + 128;
+    const long long ea0 = (long long)dxa * (py - yb) - (long long)dya * (px - xb);
+    const long long eb0 = (long long)dxb * (py - yc) - (long long)dyb * (px - xc);
+    const long long ec0 = (long long)dxc * (py - ya) - (long long)dyc * (px - xa);
+    const int bias_a = edge_bias(I(dxa), I(dya))[0], bias_b = edge_bias(I(dxb), I(dyb))[0];
+    const int bias_c = edge_bias(I(dxc), I(dyc))[0];
+    const float inv_area = 1.0f / (float)area;
+    const int low = ~triangle;
+    const V n = spread(plane.n);
+    const F offset = F(plane.offset);
+    const D lane = __builtin_convertvector(lanes(), D);
+    const double xstep_a = dya * 256.0, xstep_b = dyb * 256.0, xstep_c = dyc * 256.0;
+    const double ystep_a = dxa * 256.0, ystep_b = dxb * 256.0, ystep_c = dxc * 256.0;
+    D ea_row = (double)ea0 - lane * xstep_a, eb_row = (double)eb0 - lane * xstep_b, ec_row = (double)ec0 - lane * xstep_c;
+    for (int y = top; y <= bottom; ++y) {
+        D ea = ea_row, eb = eb_row, ec = ec_row;
+        const int cell = (y - target.y0) * width - target.x0;
+        for (int x = left; x <= right; x += LANES) {
+            const Wide within = (ea + (double)bias_a >= 0.0) & (eb + (double)bias_b >= 0.0) & (ec + (double)bias_c >= 0.0);
+            const I column = x + lanes();
+            I inside = __builtin_convertvector(within, I) & (column <= right);
+            if (bits(inside)) {
+                const F depth = (__builtin_convertvector(ea, F) * a[2] + __builtin_convertvector(eb, F) * kb
+                    + __builtin_convertvector(ec, F) * kc) * inv_area;
+                put(inside, cell + (column < target.x1 ? column : I(target.x1 - 1)), depth, n, offset, I(0), &low);
+            }
+            ea -= xstep_a * LANES;
+            eb -= xstep_b * LANES;
+            ec -= xstep_c * LANES;
+        }
+        ea_row += ystep_a;
+        eb_row += ystep_b;
+        ec_row += ystep_c;
+    }
+"""
+    )
+)
+def draw_large(
+    target: TargetView,
+    a: wp.vec3,
+    b: wp.vec3,
+    c: wp.vec3,
+    plane: PlaneView,
+    triangle: int,
+    row_first: int,
+    row_end: int,
+    ray_along_min: float,
+    ray_trust: float,
+): ...
+
+
+@wp.kernel
+def draw_rays_kernel(
+    first: int,
+    target: TargetView,
+    screen: wp.array(dtype=wp.vec4),
+    triangles: wp.array(dtype=wp.vec3i),
+    ids: wp.array(dtype=int),
+    id_offset: int,
+    points: wp.array(dtype=wp.vec3),
+    plane_triangles: wp.array(dtype=wp.vec3i),
+    out_survivor_count: wp.array(dtype=int),
+    row_first: int,
+    row_end: int,
+):
+    """As `raster.cull_kernel` and `raster.draw_kernel`, one thread per block of triangles."""
+    begin = (first + wp.tid()) * BLOCK
+    left = draw_block(
+        target,
+        screen,
+        triangles,
+        ids,
+        id_offset,
+        begin,
+        points,
+        plane_triangles,
+        row_first,
+        row_end,
+        GUARD,
+        RAY_ALONG_MIN,
+        RAY_TRUST,
+        out_survivor_count,
+    )
+    t = begin
+    while left != wp.uint64(0):
+        if (left & wp.uint64(1)) != wp.uint64(0):
+            corners = triangles[t]
+            a = screen[corners[0]]
+            b = screen[corners[1]]
+            c = screen[corners[2]]
+            triangle = t + id_offset
+            if ids.shape[0] > 0:
+                triangle = ids[t]
+            plane = triangle_plane(points, plane_triangles[t])
+            if target.painter != 0:
+                middle = (a[2] + b[2] + c[2]) / 3.0
+                a = at_depth(a, middle)
+                b = at_depth(b, middle)
+                c = at_depth(c, middle)
+            if needs_clipping(a) or needs_clipping(b) or needs_clipping(c):
+                draw_clipped(target, a, b, c, plane, triangle, row_first, row_end)
+            else:
+                draw_large(
+                    target,
+                    wp.vec3(a[0], a[1], a[2]),
+                    wp.vec3(b[0], b[1], b[2]),
+                    wp.vec3(c[0], c[1], c[2]),
+                    plane,
+                    triangle,
+                    row_first,
+                    row_end,
+                    RAY_ALONG_MIN,
+                    RAY_TRUST,
+                )
+        left = left >> wp.uint64(1)
+        t += 1
+
+
+@wp.func_native(
+    vector.snippet(r"""
+    const int end = begin + BLOCK < pixel.shape[0] ? begin + BLOCK : pixel.shape[0];
+    const float* points = (const float*)point.data;
+    const float* directions = (const float*)direction.data;
+    const V eye = spread(camera.eye), forward = spread(camera.forward);
+    for (int start = begin; start < end; start += LANES) {
+        const bool full = start + LANES <= end;
+        const int count = full ? LANES : end - start;
+        const I own = full ? start + lanes() : ipick(lanes() < count, start + lanes(), I(start));
+        const V p = vrows(points, start, full, own), d = vrows(directions, start, full, own);
+        const V to_eye = sub(p, eye);
+        const F distance = __builtin_elementwise_sqrt(dot(to_eye, to_eye));
+        const F unit_depth = distance / fmax(dot(forward, to_eye), F(1.0e-30f));
+        // Turned as they lie: eight numbers of a ray side by side.
+        float columns[8 * LANES];
+        const F column[8] = {p.x, p.y, p.z, distance, d.x, d.y, d.z, unit_depth};
+        for (int half = 0; half < LANES / 8; ++half) {
+            _Pragma("clang loop unroll(full)") for (int k = 0; k < 8; ++k) store(columns + LANES * k, column[k]);
+            int at[8];
+            for (int k = 0; k < 8; ++k) at[k] = LANES * k + 8 * half;
+            Row rows[8];
+            transposed(columns, at, rows);
+            for (int k = 0; k < 8 && 8 * half + k < count; ++k) {
+                const int i = pixel.data[start + 8 * half + k], row = i / camera.width;
+                const int cell = (row - y0) * box_width + i - row * camera.width - x0;
+                __builtin_memcpy((float*)out_ray.data + 8 * cell, &rows[k], sizeof(Row));
+            }
+        }
+    }
+""")
+)
+def ray_block(
+    begin: int,
+    camera: CameraView,
+    pixel: wp.array(dtype=int),
+    point: wp.array(dtype=wp.vec3),
+    direction: wp.array(dtype=wp.vec3),
+    x0: int,
+    y0: int,
+    box_width: int,
+    out_ray: wp.array(dtype=wp.vec4),
+): ...
+
+
+@wp.kernel
+def ray_blocks_kernel(
+    first: int,
+    camera: CameraView,
+    pixel: wp.array(dtype=int),
+    point: wp.array(dtype=wp.vec3),
+    direction: wp.array(dtype=wp.vec3),
+    x0: int,
+    y0: int,
+    box_width: int,
+    out_ray: wp.array(dtype=wp.vec4),
+):
+    """As `raster.ray_image_kernel`, one thread per block of mirror pixels."""
+    ray_block((first + wp.tid()) * BLOCK, camera, pixel, point, direction, x0, y0, box_width, out_ray)
