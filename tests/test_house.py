@@ -26,7 +26,7 @@ FLOORS = {
     "grid_rays occupancy voxels "
     "images metrics timing clipping cutouts",
     2: "scene scene_times reflectors environment_maps baked_maps "
-    "segments layers trees ray_walk bvh raster raster_vector raster_rays_vector shade shade_vector surface "
+    "segments layers trees ray_walk bvh raster raster_pieces raster_vector raster_rays_vector shade shade_vector surface "
     "surface_vector pictures textures holes cut_shadows "
     "normal_maps bounces direct shadow_starts shadow_neighbours shadows transmission "
     "transmission_vector waves waves_vector channels stage stage.* scene_field "

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_reflect import raster
+from warp_reflect import launch, raster, raster_pieces
 from warp_reflect.layers import CameraView
 
 NEAR, FAR = 0.5, 1.0e4
@@ -58,6 +58,31 @@ def covered(triangle, width, height):
             if inside:
                 result.add((x, y))
     return result
+
+
+@pytest.mark.parametrize("takers", [1, 7, raster_pieces.TAKERS])
+@pytest.mark.parametrize("box", [None, (13, 5, 190, 101)])
+def test_pieces_of_triangles_are_the_triangles(takers, box, monkeypatch):
+    """A device's way: from one pixel to all of them, cut by the eye's plane, and out of sight; pixel for pixel the same."""
+    rng = np.random.default_rng(5)
+    size = 2.0 ** rng.uniform(0, 11, (300, 1, 1))
+    corners = flat(rng.uniform(0, 200, (300, 1, 2)) * (1.0, 0.55) + size * rng.uniform(-1, 1, (300, 3, 2)))
+    corners[..., 3] = size[..., 0] * rng.uniform(0.6, 2.0, corners.shape[:2])  # small ones in front of large ones
+    corners[::100, 0, 3] = 0.3
+    corners[..., 2] = 1.0 / corners[..., 3]
+    behind = corners[..., 3] < NEAR
+    corners[behind, 2] = 0.0  # as `layers.project` gives what lies in front of the near plane
+    cut = behind.any(axis=1) & ~behind.all(axis=1)
+    assert cut.sum() == 3
+    mask = wp.array((rng.random(200 * 110) < 0.8).astype(np.int32), dtype=int, device="cpu")
+    expected = draw(corners, 200, 110, box=box, mask=mask, mask_value=1)
+    monkeypatch.setattr(raster_pieces, "TAKERS", takers)
+    with launch.as_device(), launch.recorded() as launches:
+        drawn = draw(corners, 200, 110, box=box, mask=mask, mask_value=1)
+    assert ("warp_reflect.raster_pieces.draw_pieces_kernel", takers) in launches
+    np.testing.assert_array_equal(drawn[0], expected[0])
+    np.testing.assert_array_equal(drawn[1], expected[1])
+    assert len(np.unique(drawn[0])) > 30
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -197,21 +197,21 @@ def test_body_analysis_recognises_a_convex_body():
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_bare_solver_takes_a_reflector_map(dtype):
-    """The public call, in the body's own frame far from the origin, one eye and many points."""
+def test_bare_solver_takes_a_reflector_map(dtype, device):
+    """The public call, in the body's own frame far from the origin, one eye and many points; the map was drawn on the CPU."""
     axes, _ = draw((2, 1, 1), 16)
     offset = np.array([100.0, -20.0, 7.0])
     points, faces = ellipsoid(axes)
     mirror = wr.ReflectorMap.from_mesh(points + offset, faces, resolution=128)
     r, eye, target = constructed(axes, 300, np.random.default_rng(8))
     for k in range(5):
-        answer = wr.solve(mirror, eye[k] + offset, (target[k : k + 1] + offset).astype(dtype))
+        answer = wr.solve(mirror, eye[k] + offset, (target[k : k + 1] + offset).astype(dtype), device=device)
         assert answer.point.dtype == dtype and answer.status[0] == Status.CONVERGED
         # A mesh of 96 columns deviates from the ellipsoid by 4e-4 of its size, and its normals by their interpolation.
         assert np.linalg.norm(answer.point[0] - offset - r[k]) < 1e-2
         assert answer.residual[0] < 1e-3
     bad = np.array([[np.nan, 0, 0], offset, offset + [6.0, 0, 0], offset + [50, 0, 0]], dtype)
-    answer = wr.solve(mirror, offset - [50.0, 0, 0], bad)
+    answer = wr.solve(mirror, offset - [50.0, 0, 0], bad, device=device)
     assert list(answer.status[[0, 1, 3]]) == [Status.BAD_INPUT, Status.INSIDE, Status.HIDDEN]
     assert all(np.isfinite(x).all() for x in (answer.point, answer.normal, answer.virtual, answer.residual))
 

@@ -422,6 +422,7 @@ def test_arrays_come_back_in_their_library_and_type(dtype, device):
     as_floats = solve(SPHERE, EYE, wp.array(POINTS, dtype=scalar, device=device))
     assert as_floats.point.dtype is scalar and as_floats.point.shape == (3, 3)
     np.testing.assert_array_equal(as_floats.point.numpy(), expected.point)
+    expected = solve(SPHERE, EYE, POINTS.astype(dtype), device="cpu")  # where the foreign array lies
     foreign = solve(SPHERE, EYE, Foreign(POINTS.astype(dtype)))
     assert isinstance(foreign.point, Foreign) and foreign.point.array.dtype == dtype
     np.testing.assert_array_equal(foreign.point.array, expected.point)

@@ -4,7 +4,8 @@ Coverage is decided in integers: pixel coordinates are rounded to 1/256 pixel an
 sums, with the top-left rule, so that triangles that share an edge own each pixel centre exactly once. Depth is a key
 that is linear on the screen and grows towards the eye (`layers.project`); ties go to the lower triangle id, so a
 picture does not depend on the order of drawing. Two phases: `cull_kernel` keeps the triangles that cover a pixel centre
-of the target (on the CPU run by run), `draw_kernel` draws the survivors, each CPU thread its own band of rows.
+of the target (on the CPU run by run), `draw_kernel` draws the survivors, each CPU thread its own band of rows; on a device
+threads share out what is large (`raster_pieces.py`).
 
 Source of the fixed-point rule: Direct3D 11.3 functional specification, section 3.4 (coordinate snapping and the
 top-left rule); 8 sub-pixel bits as there.
@@ -56,6 +57,8 @@ class TargetView:
     y0: int
     x1: int
     y1: int
+    column_first: int  # of the box, those drawn: [column_first, column_end)
+    column_end: int
     mask: wp.array(dtype=int)  # per image pixel; drawn only where equal to mask_value
     mask_value: int  # 0: no mask
     mask_width: int
@@ -195,8 +198,8 @@ def draw_triangle(
         k = kb
         kb = kc
         kc = k
-    left = wp.max(first_centre(wp.min(xa, wp.min(xb, xc))), target.x0)
-    right = wp.min(last_centre(wp.max(xa, wp.max(xb, xc))), target.x1 - 1)
+    left = wp.max(first_centre(wp.min(xa, wp.min(xb, xc))), target.column_first)
+    right = wp.min(last_centre(wp.max(xa, wp.max(xb, xc))), target.column_end - 1)
     top = wp.max(first_centre(wp.min(ya, wp.min(yb, yc))), wp.max(target.y0, row_first))
     bottom = wp.min(last_centre(wp.max(ya, wp.max(yb, yc))), wp.min(target.y1, row_end) - 1)
     if left > right or top > bottom:
@@ -331,15 +334,22 @@ def draw_clipped(
 
 
 @wp.func
-def covers_centre(target: TargetView, a: wp.vec4, b: wp.vec4, c: wp.vec4) -> bool:
-    """False where the snapped bounding box of an unclipped triangle holds no pixel centre of the target."""
+def centres(target: TargetView, a: wp.vec4, b: wp.vec4, c: wp.vec4) -> wp.vec4i:
+    """Pixels (left, top, right, bottom) of the target whose centres the snapped box of an unclipped triangle holds."""
     left = first_centre(snap(wp.min(a[0], wp.min(b[0], c[0]))))
     right = last_centre(snap(wp.max(a[0], wp.max(b[0], c[0]))))
     top = first_centre(snap(wp.min(a[1], wp.min(b[1], c[1]))))
     bottom = last_centre(snap(wp.max(a[1], wp.max(b[1], c[1]))))
-    return wp.max(left, target.x0) <= wp.min(right, target.x1 - 1) and wp.max(top, target.y0) <= wp.min(
-        bottom, target.y1 - 1
+    return wp.vec4i(
+        wp.max(left, target.x0), wp.max(top, target.y0), wp.min(right, target.x1 - 1), wp.min(bottom, target.y1 - 1)
     )
+
+
+@wp.func
+def covers_centre(target: TargetView, a: wp.vec4, b: wp.vec4, c: wp.vec4) -> bool:
+    """False where the snapped bounding box of an unclipped triangle holds no pixel centre of the target."""
+    box = centres(target, a, b, c)
+    return box[0] <= box[2] and box[1] <= box[3]
 
 
 @wp.kernel
@@ -396,28 +406,20 @@ def triangle_plane(points: wp.array(dtype=wp.vec3), corners: wp.vec3i) -> PlaneV
     return plane
 
 
-@wp.kernel(module=PLAIN)
-def draw_kernel(
-    first: int,
+@wp.func
+def draw_survivor(
     target: TargetView,
     screen: wp.array(dtype=wp.vec4),
     triangles: wp.array(dtype=wp.vec3i),
     ids: wp.array(dtype=int),
     id_offset: int,
-    step: int,
-    survivors: wp.array(dtype=int),
-    survivor_count: wp.array(dtype=int),
     points: wp.array(dtype=wp.vec3),
     plane_triangles: wp.array(dtype=wp.vec3i),
+    t: int,
     row_first: int,
     row_end: int,
 ):
-    """One thread per survivor of a slice; writes only rows [row_first, row_end)."""
-    i = first + wp.tid()
-    part = i / step
-    if i - part * step >= survivor_count[part]:
-        return
-    t = survivors[i]
+    """Draw triangle t into rows [row_first, row_end), clipped where it must be."""
     corners = triangles[t]
     a = screen[corners[0]]
     b = screen[corners[1]]
@@ -446,6 +448,31 @@ def draw_kernel(
             row_first,
             row_end,
         )
+
+
+@wp.kernel(module=PLAIN)
+def draw_kernel(
+    first: int,
+    target: TargetView,
+    screen: wp.array(dtype=wp.vec4),
+    triangles: wp.array(dtype=wp.vec3i),
+    ids: wp.array(dtype=int),
+    id_offset: int,
+    step: int,
+    survivors: wp.array(dtype=int),
+    survivor_count: wp.array(dtype=int),
+    points: wp.array(dtype=wp.vec3),
+    plane_triangles: wp.array(dtype=wp.vec3i),
+    row_first: int,
+    row_end: int,
+):
+    """One thread per survivor of a slice; writes only rows [row_first, row_end)."""
+    i = first + wp.tid()
+    part = i / step
+    if i - part * step >= survivor_count[part]:
+        return
+    t = survivors[i]
+    draw_survivor(target, screen, triangles, ids, id_offset, points, plane_triangles, t, row_first, row_end)
 
 
 @wp.kernel
@@ -523,6 +550,7 @@ def make_target(
     view = TargetView()
     view.key = key
     view.x0, view.y0, view.x1, view.y1 = box
+    view.column_first, view.column_end = x0, x1
     view.mask = mask if mask is not None else wp.zeros(1, dtype=int, device=device)
     view.mask_value = mask_value
     view.mask_width = camera.width
@@ -601,8 +629,9 @@ def rasterise(
     inputs = [target.view, screen, triangles, step, survivors, survivor_count, nearest]
     launch(cull_kernel, count, inputs, device, threads, align=step)
     if stays(device):
-        inputs = [target.view, screen, *named, step, survivors, survivor_count, *planes, target.box[1], target.box[3]]
-        launch(draw_kernel, count, inputs, device)
+        from warp_reflect import raster_pieces  # as above
+
+        raster_pieces.draw(target.view, count, survivors, survivor_count, [screen, *named, *planes], device)
         return survivor_count
     runs = [slice(k * step, k * step + int(n)) for k, n in enumerate(survivor_count.numpy())]
     drawn = np.concatenate([survivors.numpy()[run] for run in runs])

@@ -7,7 +7,7 @@ their resolution and faces join without seams; a gprim's nodes lie on its analyt
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import warp as wp
@@ -138,7 +138,7 @@ class ReflectorMap:
         unit_from_body: float64 [4, 4], a similarity: principal axes, centre at 0, largest half extent 1.
         extent: Half extents in the unit frame, float64 [3].
         inner_radius, outer_radius: The whitened body contains, and lies in, these balls.
-        view: For kernels.
+        view: For kernels, on the device it was made for; of another device see `on`.
         geometry: Digest of what it was drawn from, where that was asked for (`techniques.baking`).
     """
 
@@ -149,6 +149,17 @@ class ReflectorMap:
     outer_radius: float
     view: object
     geometry: str = ""
+    _elsewhere: dict = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def on(self, device: wp.DeviceLike) -> ReflectorMap:
+        """The same map where a device reaches it: itself, or a copy that is kept."""
+        device = wp.get_device(device)
+        if self.view.texels.device == device:
+            return self
+        if device not in self._elsewhere:
+            numbers = self.texels, self.unit_from_body, self.extent, self.inner_radius, self.outer_radius
+            self._elsewhere[device] = self._of(*numbers, device).of_geometry(self.geometry)
+        return self._elsewhere[device]
 
     @property
     def resolution(self) -> int:

@@ -259,6 +259,7 @@ def _(mirror: QuadricMirror, request: Request) -> Answer:
 def _(mirror: ReflectorMap, request: Request) -> Answer:
     if request.method != "newton" or request.all_roots:
         raise ValueError("solve: a reflector map holds a convex body, which has one root; use method='newton' alone")
+    mirror = mirror.on(request.points.device)
     answer = Answer.empty(request, 1)
     unit_from_world = wp.mat44d(mirror.unit_from_body)
     world_from_unit = wp.mat44d(np.linalg.inv(mirror.unit_from_body))

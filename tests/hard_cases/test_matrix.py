@@ -156,7 +156,7 @@ def look_up(drawn, directions, device):
     texel = wp.zeros(len(directions), dtype=int, device=device)
     point = wp.zeros(len(directions), dtype=wp.vec3, device=device)
     given = wp.array(directions, dtype=wp.vec3, device=device)
-    wp.launch(texel_kernel, len(directions), [drawn.view, given, texel, point], device=device)
+    wp.launch(texel_kernel, len(directions), [drawn.on(device).view, given, texel, point], device=device)
     return texel.numpy(), point.numpy()
 
 
