@@ -12,7 +12,7 @@ from rooms import CHROME, placed, plane_room, room, sphere, square
 
 import warp_reflect as wr
 from warp_reflect import raster, reflector_maps, surface, surface_vector, vector
-from warp_reflect.layers import Camera, CameraView
+from warp_reflect.layers import Camera, CameraView, MirrorPixels
 from warp_reflect.raster import make_target, rasterise
 from warp_reflect.scene import CameraData, InstanceData, LightData, MaterialData, Scene, SceneData
 from warp_reflect.techniques import grid, map_search, quadric_patch, refine, reflector_map
@@ -171,6 +171,38 @@ def test_bands_of_rows_are_narrow_where_triangles_are_many():
     rows = np.full(1000, 600.0)  # one of BALANCED_BY each
     (_, middle), _ = raster.balanced_bands((0, 0, 1280, 720), rows, 2)
     assert 592 <= middle <= 600
+
+
+@pytest.mark.parametrize("shape", ["full rows", "scattered", "one", "all"])
+def test_cells_without_a_ray_hold_zeros(shape, monkeypatch):
+    """In memory that held something else before, by the plain kernel and by vectors."""
+    rng = np.random.default_rng(8)
+    size, box = (60, 40), (5, 7, 55, 33)
+    inside = np.zeros((size[1], size[0]), bool)
+    inside[box[1] : box[3], box[0] : box[2]] = {
+        "full rows": np.arange(26)[:, None] % 5 == 1,
+        "scattered": rng.random((26, 50)) < 0.3,
+        "one": (np.arange(26)[:, None] == 12) & (np.arange(50) == 30),
+        "all": True,
+    }[shape]
+    pixel = np.flatnonzero(inside).astype(np.int32)
+    point, direction = rng.normal(size=(2, len(pixel), 3)).astype(np.float32)
+    point[:, 2] = -3.0 - rng.random(len(pixel))
+    arrays = [wp.array(each, dtype=wp.vec3, device=CPU) for each in (point, direction, direction)]
+    pixels = MirrorPixels(1, wp.array(pixel, dtype=int, device=CPU), arrays[0], arrays[1], arrays[2], box)
+    view = CameraView()
+    view.width, view.height, view.near, view.far, view.forward = *size, 1.0e-3, 1.0e3, wp.vec3(0.0, 0.0, -1.0)
+    stale = lambda count, dtype, device: wp.array(np.full((count, 4), np.nan, np.float32), dtype=dtype, device=device)  # noqa: E731
+    monkeypatch.setattr(wp, "empty", stale)
+    images = {}
+    for kernels, threads in (("plain", 1), ("plain", 2), ("vector", 1), ("vector", 2)):
+        target = make_target(view, box, CPU)
+        raster.attach_rays(target, view, pixels, threads, kernels)
+        images[kernels, threads] = target.view.ray.numpy().reshape(box[3] - box[1], box[2] - box[0], 8)
+    there = inside[box[1] : box[3], box[0] : box[2]]
+    for image in images.values():
+        assert (image[~there] == 0.0).all() and (image[there][:, 3] > 0.0).all()
+        np.testing.assert_allclose(image, images["plain", 1], rtol=1e-6)
 
 
 def rays_of(rng, count):

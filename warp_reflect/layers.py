@@ -340,6 +340,7 @@ def meeting(scene: Scene, layer: ReflectionLayer, patches: np.ndarray) -> wp.arr
         inputs = [layer.triangle, scene.view.triangle_patch, scene.facts[key], met]
         launch(met_kernel, len(met), inputs, scene.device)
         return compact.padded(met, 1)[0]
-    triangle = layer.triangle.numpy()
-    met = scene.host_triangle_patch.take(triangle, mode="clip")
-    return compact.listed(np.flatnonzero(patches.take(met) & (triangle >= 0)), scene.device)
+    key = "triangles of patches", None, patches.tobytes()
+    if key not in scene.facts:
+        scene.facts[key] = np.append(patches.take(scene.host_triangle_patch), False)  # the last is that of triangle -1
+    return compact.listed(np.flatnonzero(scene.facts[key].take(layer.triangle.numpy())), scene.device)

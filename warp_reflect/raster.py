@@ -484,6 +484,13 @@ def project_kernel(
     out_screen[i] = project(camera, points[i] - camera.eye)
 
 
+@wp.func
+def ray_cell(camera: CameraView, pixel: int, x0: int, y0: int, box_width: int) -> int:
+    """The cell of a target's box that a pixel of its image is."""
+    row = pixel / camera.width
+    return (row - y0) * box_width + pixel - row * camera.width - x0
+
+
 @wp.kernel(module=RAYS)
 def ray_image_kernel(
     first: int,
@@ -496,10 +503,18 @@ def ray_image_kernel(
     box_width: int,
     out_ray: wp.array(dtype=wp.vec4),
 ):
-    """One thread per mirror pixel: (origin, the eye's distance) and (direction, the eye ray's length at depth 1)."""
+    """One thread per mirror pixel: (origin, the eye's distance) and (direction, the eye ray's length at depth 1).
+
+    Pixels ascend, and so do their cells: those up to the next one, which have no ray, are cleared.
+    """
     i = first + wp.tid()
-    row = pixel[i] / camera.width
-    cell = (row - y0) * box_width + pixel[i] - row * camera.width - x0
+    cell = ray_cell(camera, pixel[i], x0, y0, box_width)
+    end = out_ray.shape[0] / 2
+    if i + 1 < pixel.shape[0]:
+        end = ray_cell(camera, pixel[i + 1], x0, y0, box_width)
+    for k in range(wp.where(i == 0, 0, cell + 1), end):
+        out_ray[2 * k] = wp.vec4(0.0, 0.0, 0.0, 0.0)
+        out_ray[2 * k + 1] = wp.vec4(0.0, 0.0, 0.0, 0.0)
     p = point[i]
     d = direction[i]
     to_eye = p - camera.eye
@@ -516,7 +531,8 @@ def attach_rays(
     Cells without a ray hold zeros.
     """
     device = target.key.device
-    target.view.ray = wp.zeros(2 * len(target.key), dtype=wp.vec4, device=device)
+    make = wp.empty if pixels.count else wp.zeros
+    target.view.ray = make(2 * len(target.key), dtype=wp.vec4, device=device)
     x0, y0, x1, _ = target.box
     inputs = [camera, pixels.pixel, pixels.point, pixels.direction, x0, y0, x1 - x0, target.view.ray]
     if vector.chosen(kernels, device):

@@ -512,6 +512,19 @@ def draw_rays_kernel(
             }
         }
     }
+    // Pixels ascend, and so do cells: those up to the next pixel's have no ray.
+    const int last = pixel.shape[0], cells = out_ray.shape[0] / 2;
+    auto cell_of = [&](int place) -> int {
+        if (place == last) return cells;
+        const int i = pixel.data[place], row = i / camera.width;
+        return (row - y0) * box_width + i - row * camera.width - x0;
+    };
+    auto clear = [&](int from, int to) {
+        if (to > from) __builtin_memset((float*)out_ray.data + 8 * from, 0, sizeof(Row) * (to - from));
+    };
+    if (begin == 0) clear(0, cell_of(0));
+    if (cell_of(end) - cell_of(begin) == end - begin) return;
+    for (int i = begin; i < end; ++i) clear(cell_of(i) + 1, cell_of(i + 1));
 """)
 )
 def ray_block(

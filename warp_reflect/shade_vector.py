@@ -20,6 +20,8 @@ from warp_reflect.textures import Look
 
 wp.set_module_options({"enable_backward": False})
 
+HITS_SPLIT_MIN = 16  # blocks of rays; those of a few pixels meet triangles all over the scene, at 8 us a block
+
 
 @wp.func_native(
     vector.snippet(
@@ -377,4 +379,4 @@ def shade_rays(
     rays = [layer.pixels.direction, layer.u, layer.v]
     inputs = [0, scene.view, scene.triangle_records, gbuffer.view, *light, layer.triangle, _none(int, device), *rays]
     inputs += [_none(wp.vec4, device), _none(wp.vec3, device), radiance]
-    vector.launch_blocks(shade_blocks_kernel, layer.pixels.count, inputs, device, threads)
+    vector.launch_blocks(shade_blocks_kernel, layer.pixels.count, inputs, device, threads, split_min=HITS_SPLIT_MIN)

@@ -257,13 +257,22 @@ def block_count(count: int) -> int:
     return -(-count // BLOCK)
 
 
-def launch_blocks(kernel, count: int, inputs: list, device, threads: int = 0, blocks: int = 1) -> None:
+def launch_blocks(
+    kernel,
+    count: int,
+    inputs: list,
+    device,
+    threads: int = 0,
+    blocks: int = 1,
+    split_min: int = BLOCK_SPLIT_MIN,
+) -> None:
     """Run a vector kernel, whose arguments after `first` are `inputs`, over `count` elements.
 
     Args:
         blocks: Of each of its tasks.
+        split_min: Blocks from which on it is split over threads.
     """
-    launch(kernel, -(-block_count(count) // blocks), inputs, device, threads, split_min=BLOCK_SPLIT_MIN // blocks)
+    launch(kernel, -(-block_count(count) // blocks), inputs, device, threads, split_min=split_min // blocks)
 
 
 @wp.func_native(

@@ -6,6 +6,7 @@ import numpy as np
 import warp as wp
 
 from warp_reflect import raster
+from warp_reflect.launch import stays
 from warp_reflect.layers import Camera
 from warp_reflect.optics import virtual_point
 from warp_reflect.scene import Scene
@@ -80,7 +81,12 @@ def solve_frame(scene: Scene, camera: Camera, unit_from_scene: np.ndarray) -> So
 def empty_vertices(count: int, device, with_position: bool = False) -> VertexView:
     """Per-vertex results before a solver ran: nothing has a picture."""
     vertices = VertexView()
-    vertices.screen = wp.full(count, wp.vec4(0.0, 0.0, raster.DROPPED, 0.0), dtype=wp.vec4, device=device)
+    dropped = (0.0, 0.0, raster.DROPPED, 0.0)
+    if stays(device):
+        vertices.screen = wp.full(count, wp.vec4(*dropped), dtype=wp.vec4, device=device)
+    else:  # NumPy fills in vectors several times as fast as Warp
+        vertices.screen = wp.empty(count, dtype=wp.vec4, device=device)
+        vertices.screen.numpy()[:] = dropped
     vertices.status = wp.zeros(count, dtype=wp.uint8, device=device)
     vertices.residual = wp.zeros(count, dtype=float, device=device)
     vertices.reach = wp.zeros(count, dtype=float, device=device)
