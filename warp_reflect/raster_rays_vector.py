@@ -3,9 +3,10 @@
 Virtual meshes have more triangles than their pictures have pixels, most of them slivers or smaller than a pixel: what such a
 triangle costs is what it costs to find out that it covers nothing. So nothing is culled beforehand and read again. Triangles
 of a block are read as they lie, set up in vectors, and their rows are walked side by side: edges are divided by their slopes
-for the columns between them, in float32, a little too wide. What lies between is listed; a list's vectors are full however few
-pixels a triangle has. Whether a fragment is inside is told by its exact edge functions when it is worked on, and what it needs
-of memory has been asked for by then.
+for the columns between them, in float32, a little too wide. Runs of pixels that lie between are put one after the other
+without a branch; only triangles that have some get their planes, and the pixels of all of them one list, whose vectors are
+full however few pixels a triangle has. Whether a fragment is inside is told by its exact edge functions when it is worked on,
+and what it needs of memory has been asked for by then.
 
 Triangles beyond a box of 64 pixels are drawn one at a time in float64, whose 53 bits hold everything below 2^46; within it
 edge functions are exact in 32 bits (products below 2^29, sums of two below 2^30). What has to be clipped goes to the plain
@@ -39,6 +40,13 @@ _TARGET = r"""
     auto snap = [](F x) -> I { return __builtin_convertvector(__builtin_elementwise_floor(x * 256.0f + 0.5f), I); };
     // raster.edge_bias
     auto edge_bias = [](I dx, I dy) -> I { return ((dy < 0) | ((dy == 0) & (dx > 0))) ? I(0) : I(-1); };
+    auto marks = [&](I mask) -> unsigned {
+#if defined(__AVX__) && !defined(__AVX512F__)
+        return __builtin_ia32_movmskps256(__builtin_bit_cast(F, mask));
+#else
+        return bits(mask);
+#endif
+    };
     const int width = target.x1 - target.x0;
     const float* ray_of = (const float*)target.ray.data;
     unsigned long long* keys = (unsigned long long*)target.key.data;
@@ -69,7 +77,7 @@ _TARGET = r"""
         store(depths, depth);
         istore(cells, cell);
         istore(owners, owner);
-        for (unsigned left = bits(inside & (depth >= now)); left != 0; left &= left - 1) {
+        for (unsigned left = marks(inside & (depth >= now)); left != 0; left &= left - 1) {
             const int l = __builtin_ctz(left);
             const unsigned high = __builtin_bit_cast(unsigned, depths[l]);
             const unsigned long long key = ((unsigned long long)high << 32) | (unsigned)low_of[owners[l]];
@@ -89,15 +97,15 @@ _TARGET = r"""
     auto most = [](I p, I q) -> I { return p > q ? p : q; };
     auto whole = [](F x) -> I { return __builtin_convertvector(x, I); };
     auto apart = [](V a, F s) -> V { return V{a.x / s, a.y / s, a.z / s}; };
-    // The first three of four floats at p[4 * index[l]].
-    auto gather4 = [](const float* p, I index) -> V {
+    // The first three of four floats at p[start[l]].
+    auto threes = [](const float* p, I start) -> V {
         typedef float Four __attribute__((ext_vector_type(4)));
         V v;
         _Pragma("clang loop unroll(full)") for (int part = 0; part < LANES; part += 8) {
             Four r[8];
             Row s[4];
             _Pragma("clang loop unroll(full)") for (int l = 0; l < 8; ++l)
-                __builtin_memcpy(&r[l], p + 4 * index[part + l], sizeof(Four));
+                __builtin_memcpy(&r[l], p + start[part + l], sizeof(Four));
             _Pragma("clang loop unroll(full)") for (int l = 0; l < 4; ++l)
                 s[l] = __builtin_shufflevector(r[l], r[l + 4], 0, 1, 2, 3, 4, 5, 6, 7);
             const Row xy = __builtin_shufflevector(s[0], s[1], 0, 1, 8, 9, 4, 5, 12, 13);
@@ -113,8 +121,38 @@ _TARGET = r"""
         }
         return v;
     };
+    // Puts the words of the lanes that are marked one after the other; up to LANES words at `to` are written.
+    auto packed = [](int* to, I words, unsigned marked) -> int {
+#if defined(__AVX2__)
+        struct Order { unsigned long long of[256]; };
+        static constexpr Order order = []() constexpr {
+            Order made{};
+            for (int mask = 0; mask < 256; ++mask)
+                for (int l = 0, n = 0; l < 8; ++l)
+                    if (mask >> l & 1) made.of[mask] |= (unsigned long long)l << 8 * n++;
+            return made;
+        }();
+        typedef int Eight __attribute__((ext_vector_type(8)));
+        typedef unsigned char Bytes __attribute__((ext_vector_type(8)));
+        int count = 0;
+        _Pragma("clang loop unroll(full)") for (int part = 0; part < LANES; part += 8) {
+            const unsigned own = marked >> part & 255;
+            Eight eight;
+            __builtin_memcpy(&eight, (const int*)&words + part, sizeof(eight));
+            eight = __builtin_ia32_permvarsi256(eight,
+                __builtin_convertvector(__builtin_bit_cast(Bytes, order.of[own]), Eight));
+            __builtin_memcpy(to + count, &eight, sizeof(eight));
+            count += __builtin_popcount(own);
+        }
+        return count;
+#else
+        int count = 0;
+        EACH_LANE { to[count] = words[l]; count += marked >> l & 1; }
+        return count;
+#endif
+    };
     const float* corner_of = (const float*)triangles.data;
-    const float* plane_corner_of = (const float*)plane_triangles.data;
+    const int* plane_corner_of = (const int*)plane_triangles.data;
     const float* point_of = (const float*)points.data;
     const float* screen_of = (const float*)screen.data;
     const int row0 = target.y0 > row_first ? target.y0 : row_first;
@@ -127,11 +165,15 @@ _TARGET = r"""
     enum { EA, EB, STEP_A, ROW_A, STEP_B, ROW_B, AREA, CELL, KEY_A, KEY_B, KEY_C, OPEN, NX, NY, NZ, OFFSET };
     constexpr int FIELDS = 16;
     float record[BLOCK * FIELDS];
-    int low_of[BLOCK];
-    // Fragments: owner, row and column from the triangle's first pixel.
-    int list[LISTED + SIDE * LANES + SIDE + 2 * LANES];
+    int low_of[BLOCK], cell_of[BLOCK];
+    // Runs of fragments: owner, row, first column from the triangle's first pixel, and how many, 8 bits each.
+    int runs[BLOCK * SIDE + LANES];
+    int run_count = 0;
+    unsigned long long touched = 0;  // a bit for each owner of runs
+    // Fragments: owner, row and column.
+    int list[LISTED + SIDE + LANES];
     int listed = 0;
-    auto flush = [&]() {
+    auto flush = [&]() __attribute__((noinline)) {
         for (int start = 0; start < listed; start += LANES) {
             const I valid = start + lanes() < listed;
             const I fragment = ipick(valid, iload(list + start), I(list[start]));
@@ -164,7 +206,7 @@ _TARGET = r"""
         const I corner[3] = {__builtin_bit_cast(I, corners_as_floats.x), __builtin_bit_cast(I, corners_as_floats.y),
             __builtin_bit_cast(I, corners_as_floats.z)};
         V v[3];
-        _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each) v[each] = gather4(screen_of, corner[each]);
+        _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each) v[each] = threes(screen_of, 4 * corner[each]);
         F k[3] = {v[0].z, v[1].z, v[2].z};
         // Dropped vertices, and those that are not a number.
         const I kept = valid & (k[0] >= 0.0f) & (k[1] >= 0.0f) & (k[2] >= 0.0f);
@@ -224,7 +266,6 @@ _TARGET = r"""
         const I columns = right - left, rows = ipick(drawn, bottom - top, I(-1));
         const I cell = (top - target.y0) * width + left - target.x0;
         const int own = start - begin;
-        istore(low_of + own, ~(ids.shape[0] > 0 ? igather(ids.data, t) : t + id_offset));
         // Columns from `edge / step` on, or up to there. Half of a 1/65536 pixel off, no quotient is 0 by 0.
         F inverse[3];
         I is_left[3], at_row[3], down[3];
@@ -237,51 +278,12 @@ _TARGET = r"""
             at_row[each] = e[each] + bias;
             down[each] = dx[each] * 256;
         }
-        // raster.triangle_plane
-        V p[3];
-        I plane_corner[3] = {corner[0], corner[1], corner[2]};
-        if (plane_corner_of != corner_of) {
-            const V read = vrows(plane_corner_of, start, full, t);
-            plane_corner[0] = __builtin_bit_cast(I, read.x);
-            plane_corner[1] = __builtin_bit_cast(I, read.y);
-            plane_corner[2] = __builtin_bit_cast(I, read.z);
-        }
-        _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each) p[each] = vgather(point_of, plane_corner[each]);
-        const V n = cross(sub(p[1], p[0]), sub(p[2], p[0]));
-        const F square = dot(n, n);
-        const I safe = (square > 1.0e-24f) & (square < 1.0e24f);
-        V plane = times(1.0f / __builtin_elementwise_sqrt(square), n);
-        if (bits(~safe)) {
-            const V s = apart(n, size(n));
-            plane = vpick(safe, plane, vpick(size(n) == 0.0f, same(0.0f), apart(s, __builtin_elementwise_sqrt(dot(s, s)))));
-        }
-        {
-            float columns_of[FIELDS * LANES];
-            auto keep = [&](int field, I value) { istore((int*)columns_of + LANES * field, value); };
-            auto keep_float = [&](int field, F value) { store(columns_of + LANES * field, value); };
-            keep(EA, e[0]); keep(EB, e[1]);
-            keep(STEP_A, dy[0] * 256); keep(ROW_A, down[0]);
-            keep(STEP_B, dy[1] * 256); keep(ROW_B, down[1]);
-            keep(AREA, area); keep(CELL, cell);
-            keep_float(KEY_A, k[0]); keep_float(KEY_B, pick(turned, k[2], k[1])); keep_float(KEY_C, pick(turned, k[1], k[2]));
-            keep(OPEN, open);
-            keep_float(NX, plane.x); keep_float(NY, plane.y); keep_float(NZ, plane.z); keep_float(OFFSET, dot(plane, p[0]));
-            _Pragma("clang loop unroll(full)") for (int part = 0; part < LANES; part += 8)
-                _Pragma("clang loop unroll(full)") for (int half = 0; half < FIELDS; half += 8) {
-                    int at[8];
-                    for (int field = 0; field < 8; ++field) at[field] = LANES * (half + field) + part;
-                    Row turned_rows[8];
-                    transposed(columns_of, at, turned_rows);
-                    for (int l = 0; l < 8; ++l)
-                        __builtin_memcpy(record + FIELDS * (own + part + l) + half, &turned_rows[l], sizeof(Row));
-                }
-        }
         const F last = __builtin_convertvector(columns, F);
-        int cells[LANES], first_of[LANES], length_of[LANES];
-        istore(cells, cell);
         int row_count = 0;
         EACH_LANE row_count = rows[l] >= row_count ? rows[l] + 1 : row_count;
-        for (int y = 0; y < row_count; ++y) {
+        I run = ((own + lanes()) << 24) + 1;
+        unsigned owners = 0;
+        for (int y = 0; y < row_count; ++y, run += 1 << 16) {
             F from = F(0.0f), to = last;
             _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each) {
                 const F bound = (__builtin_convertvector(at_row[each], F) + 0.5f) * inverse[each];
@@ -292,26 +294,86 @@ _TARGET = r"""
             // Quotients up to 64 are rounded by less than 2e-5.
             from = __builtin_elementwise_ceil(from - 1.0e-4f);
             to = __builtin_elementwise_floor(to + 1.0e-4f);
-            unsigned some = bits((from <= to) & (y <= rows));
-            if (some == 0) continue;
-            istore(first_of, whole(from));
-            istore(length_of, whole(to - from) + 1);
-            for (; some != 0; some &= some - 1) {
-                const int l = __builtin_ctz(some);
-                const int x = first_of[l], length = length_of[l];
-                const int at = cells[l] + y * width + x;
-                __builtin_prefetch(keys + at);
-                __builtin_prefetch(ray_of + 8 * at);
-                __builtin_prefetch(ray_of + 8 * (at + length - 1));
-                const int fragment = (own + l) << 16 | y << 8 | x;
-                for (int part = 0; part < length; part += LANES) istore(list + listed + part, fragment + part + lanes());
-                listed += length;
-            }
-            if (listed >= LISTED) flush();
+            const I some = (from <= to) & (y <= rows);
+            const unsigned marked = marks(some);
+            owners |= marked;
+            // Of lanes without a run any number.
+            run_count += packed(runs + run_count, run + whole(pick(some, from * 255.0f + to, F(0.0f))), marked);
         }
+        if (owners == 0) continue;
+        touched |= (unsigned long long)owners << own;
+        istore(cell_of + own, cell);
+        istore(low_of + own, ~(ids.shape[0] > 0 ? igather(ids.data, t) : t + id_offset));
+        float fields[(FIELDS - 4) * LANES];
+        auto keep = [&](int field, I value) { istore((int*)fields + LANES * field, value); };
+        auto keep_float = [&](int field, F value) { store(fields + LANES * field, value); };
+        keep(EA, e[0]);
+        keep(EB, e[1]);
+        keep(STEP_A, dy[0] * 256);
+        keep(ROW_A, down[0]);
+        keep(STEP_B, dy[1] * 256);
+        keep(ROW_B, down[1]);
+        keep(AREA, area);
+        keep(CELL, cell);
+        keep_float(KEY_A, k[0]);
+        keep_float(KEY_B, pick(turned, k[2], k[1]));
+        keep_float(KEY_C, pick(turned, k[1], k[2]));
+        keep(OPEN, open);
+        _Pragma("clang loop unroll(full)") for (int part = 0; part < LANES; part += 8)
+            _Pragma("clang loop unroll(full)") for (int half = 0; half < FIELDS; half += 8) {
+                int at[8];
+                for (int field = 0; field < 8; ++field) at[field] = LANES * ((half + field) % (FIELDS - 4)) + part;
+                Row lying[8];
+                transposed(fields, at, lying);
+                for (int l = 0; l < 8; ++l)
+                    __builtin_memcpy(record + FIELDS * (own + part + l) + half, &lying[l], sizeof(Row));
+            }
     }
-    flush();
     if (row0 == target.y0) out_survivor_count.data[0] += survivors;
+
+    // raster.triangle_plane of those that have runs.
+    int owner_of[BLOCK + LANES];
+    int owner_count = 0;
+    for (unsigned long long left_over = touched; left_over != 0; left_over &= left_over - 1)
+        owner_of[owner_count++] = __builtin_ctzll(left_over);
+    for (int start = 0; start < owner_count; start += LANES) {
+        const I owner = ipick(start + lanes() < owner_count, iload(owner_of + start), I(owner_of[start]));
+        V p[3];
+        I corner[3];
+        I last = I(0);
+        _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each) {
+            corner[each] = igather(plane_corner_of, 3 * (begin + owner) + each);
+            last |= corner[each] >= points.shape[0] - 1;
+        }
+        // Of the last point there are but three floats to read.
+        if (bits(last)) {
+            _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each) p[each] = vgather(point_of, corner[each]);
+        } else {
+            _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each) p[each] = threes(point_of, 3 * corner[each]);
+        }
+        const V n = cross(sub(p[1], p[0]), sub(p[2], p[0]));
+        const F square = dot(n, n);
+        const I safe = (square > 1.0e-24f) & (square < 1.0e24f);
+        V plane = times(1.0f / __builtin_elementwise_sqrt(square), n);
+        if (bits(~safe)) {
+            const V s = apart(n, size(n));
+            plane = vpick(safe, plane, vpick(size(n) == 0.0f, same(0.0f), apart(s, __builtin_elementwise_sqrt(dot(s, s)))));
+        }
+        float planes[4 * LANES];
+        vstore4(planes, 0, plane, dot(plane, p[0]));
+        for (int l = 0; l < LANES; ++l)
+            __builtin_memcpy(record + FIELDS * owner[l] + NX, planes + 4 * l, 4 * sizeof(float));
+    }
+    for (int k = 0; k < run_count; ++k) {
+        const int fragment = (int)((unsigned)runs[k] >> 8), length = runs[k] & 255;
+        const int at = cell_of[fragment >> 16] + (fragment >> 8 & 255) * width + (fragment & 255);
+        __builtin_prefetch(keys + at);
+        __builtin_prefetch(ray_of + 8 * at);
+        __builtin_prefetch(ray_of + 8 * (at + length - 1));
+        for (int part = 0; part < length; part += LANES) istore(list + listed + part, fragment + part + lanes());
+        listed += length;
+        if (listed >= LISTED || k + 1 == run_count) flush();
+    }
     return others;
 """,
         "return 0;",
