@@ -168,7 +168,7 @@ def onward(
     """
     device, width = scene.device, gbuffer.camera.size[0]
     index: wp.array | None = None  # of the first layer's rays; None: all
-    weight = wp.zeros(0, dtype=wp.vec3, device=device)
+    weight = compact.none(wp.vec3, device)
     first, total = layer, seen
     for depth in range(bounces + 1):
         asked = meeting(scene, layer, mirrors.patches)

@@ -380,7 +380,7 @@ def trace_pixels(
         int(index is not None),
     ]
     outputs = [layer.triangle, layer.u, layer.v, layer.distance, layer.status]
-    start = [gbuffer.triangle, pixels.pixel, rays[7], wp.zeros(0, dtype=OwnBody, device=scene.device)]
+    start = [gbuffer.triangle, pixels.pixel, rays[7], compact.none(OwnBody, scene.device)]
     width = gbuffer.camera.size[0]
     known, left, missed = _first_met(
         scene, scene.mirror_tracer(part), layer, start, index, False, threads, kernels, width
@@ -442,7 +442,7 @@ def _first_met(
     start = [
         *start,
         scene.view.triangle_patch,
-        wp.empty(0, dtype=wp.uint8, device=scene.device) if inside is None else inside,
+        compact.none(wp.uint8, scene.device) if inside is None else inside,
     ]
     state = bvh_vector.first_met(
         tracer.packets, scene.triangle_records, rays, start, index, pixels.pixel, width, retry, outputs, threads
@@ -475,7 +475,7 @@ def trace_transmitted(
     """
     pixels, device = layer.pixels, scene.device
     bodies = scene.kept("bodies of parts", None, lambda: _part_bodies(scene))
-    start = [facet, wp.empty(0, dtype=int, device=device), OwnBody(), bodies]
+    start = [facet, compact.none(int, device), OwnBody(), bodies]
     known, left, _ = _first_met(scene, scene.tracer, layer, start, index, True, threads, kernels, width, inside)
     if left:
         some = [facet if index is None else index, int(index is not None)]
@@ -525,7 +525,7 @@ def trace_bounced(
         width: Of the picture that the pixels are of; 0: not known.
     """
     pixels = layer.pixels
-    start = [facet, wp.zeros(0, dtype=int, device=scene.device), OwnBody(), bodies]
+    start = [facet, compact.none(int, scene.device), OwnBody(), bodies]
     known, left, _ = _first_met(scene, scene.tracer, layer, start, None, True, threads, kernels, width)
     if left:
         some = _with_status(layer, None, Status.NONE) if known else [facet, 0]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from warp_reflect import vector
+from warp_reflect import compact, vector
 from warp_reflect.launch import launch
 from warp_reflect.ray_walk import OwnBody
 from warp_reflect.settings import Status
@@ -426,7 +426,7 @@ def first_met(
             blocks = (int(own[-1]) // (TILE_HEIGHT * width) + 1 - first_band) * -(-width // STRIP)
         else:
             width = 0
-    which = [wp.zeros(0, dtype=int, device=device) if index is None else index, int(index is not None)]
+    which = [compact.none(int, device) if index is None else index, int(index is not None)]
     state = wp.empty(blocks, dtype=int, device=device)
     inputs = [
         wp.uint64(mesh),

@@ -7,6 +7,7 @@ at hand anyway NumPy finds the numbers faster than kernels do.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 
 import numpy as np
 import warp as wp
@@ -16,6 +17,16 @@ from warp_reflect.launch import launch, stays
 wp.set_module_options({"enable_backward": False})
 
 RUN = wp.constant(32)  # values that a thread looks at: four launches for a large picture
+
+
+@cache
+def _none(dtype, device: str) -> wp.array:
+    return wp.empty(0, dtype=dtype, device=device)
+
+
+def none(dtype, device) -> wp.array:
+    """The array of length 0 that stands for one that a kernel is not given: always the same, since a frame has dozens."""
+    return _none(dtype, str(device))
 
 
 def listed(numbers: np.ndarray, device) -> wp.array:

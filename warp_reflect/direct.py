@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from warp_reflect import launch
+from warp_reflect import compact, launch
 from warp_reflect.layers import CameraView, GBuffer, ReflectionLayer, eye_ray_direction, eye_ray_origin
 from warp_reflect.scene import LightData, Scene, SceneView
 from warp_reflect.shapes import clamp_weights, intersect_triangle, unit
@@ -325,13 +325,13 @@ def points_of(
     if layer is not None:
         pixels = layer.pixels
         return Points(layer.triangle, layer.u, layer.v, pixels.direction, pixels.pixel, *size)
-    triangle, pixel = gbuffer.triangle, wp.zeros(0, dtype=int, device=device)
+    triangle, pixel = gbuffer.triangle, compact.none(int, device)
     if chosen is not None:
         triangle = wp.array(triangle.numpy()[chosen], dtype=int, device=device, copy=False)
         pixel = wp.array(chosen, dtype=int, device=device, copy=False)
     if not weighed:
-        none = wp.zeros(0, dtype=float, device=device)
-        direction = wp.zeros(0, dtype=wp.vec3, device=device)
+        none = compact.none(float, device)
+        direction = compact.none(wp.vec3, device)
         return Points(triangle, none, none, direction, pixel, *size, gbuffer.view)
     direction = wp.zeros(len(triangle), dtype=wp.vec3, device=device)
     u, v = (wp.zeros(len(triangle), dtype=float, device=device) for _ in range(2))
@@ -358,7 +358,7 @@ def direct_irradiance(
     device = scene.device
     result = wp.zeros(len(points.triangle), dtype=wp.vec3, device=device)
     if normals is None:
-        normals = wp.zeros(0, dtype=wp.vec3, device=device)
+        normals = compact.none(wp.vec3, device)
     inputs = [scene.view, lights, points.triangle, points.u, points.v, points.direction, normals, result]
     launch.launch(direct_kernel, len(points.triangle), inputs, device, threads)
     return result

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 import warp as wp
 
-from warp_reflect import applicable
+from warp_reflect import applicable, compact
 from warp_reflect.budget import Costs, predict
 from warp_reflect.launch import thread_count
 from warp_reflect.layers import Camera, GBuffer, MirrorPixels, ReflectionLayer, pixel_bounds
@@ -149,7 +149,7 @@ def _seen_from(
         eye,
         eye.view(scene),
         wp.array(triangle, dtype=int, device=device),
-        wp.zeros(0, dtype=float, device=device),
+        compact.none(float, device),
         wp.array(reflector, dtype=int, device=device),
     )
     numbers = wp.array(pixel, dtype=int, device=device)

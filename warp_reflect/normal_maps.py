@@ -12,7 +12,7 @@ from collections.abc import Collection
 import numpy as np
 import warp as wp
 
-from warp_reflect import launch
+from warp_reflect import compact, launch
 from warp_reflect.layers import CameraView, GBuffer, ReflectionLayer, eye_ray_direction, eye_ray_origin
 from warp_reflect.scene import Scene, SceneView
 from warp_reflect.shapes import clamp_weights, intersect_triangle, max_abs, unit
@@ -168,7 +168,7 @@ def prepare_normals(
     """
     textures = scene.textures
     if textures.normal_count == 0:
-        return wp.zeros(0, dtype=wp.vec3, device=scene.device)
+        return compact.none(wp.vec3, scene.device)
     if layer is None:
         normals = wp.zeros(len(gbuffer.triangle), dtype=wp.vec3, device=scene.device)
         inputs = [scene.view, gbuffer.view, textures, gbuffer.triangle, gbuffer.reflector_id]

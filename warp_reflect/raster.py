@@ -21,7 +21,7 @@ import numpy as np
 import warp as wp
 
 from warp_reflect import vector
-from warp_reflect.compact import listed
+from warp_reflect.compact import listed, none
 from warp_reflect.launch import launch, launch_bands, module_part, shared_by, stays
 from warp_reflect.layers import Camera, CameraView, GBuffer, MirrorPixels, project
 from warp_reflect.scene import Scene
@@ -574,7 +574,7 @@ def make_target(
     view.near = camera.near
     view.far = camera.far
     view.orthographic = camera.orthographic
-    view.ray = wp.empty(0, dtype=wp.vec4, device=device)
+    view.ray = none(wp.vec4, device)
     return Target(view, key, box)
 
 
@@ -613,9 +613,9 @@ def rasterise(
     step = count if parts == 1 else -(-count // (parts * CULL_RUNS * vector.BLOCK)) * vector.BLOCK
     vectors = vector.chosen(kernels, device)
     if ids is None:
-        ids = wp.empty(0, dtype=int, device=device)
+        ids = none(int, device)
     if points is None:
-        points = wp.empty(0, dtype=wp.vec3, device=device)
+        points = none(wp.vec3, device)
     named = [triangles, ids, id_offset]
     planes = [points, triangles if plane_triangles is None else plane_triangles]
 

@@ -26,7 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from warp_reflect import launch, vector
+from warp_reflect import compact, launch, vector
 from warp_reflect.direct import AREA_KINDS, AreaView, DirectView, direct_irradiance, points_of, prepare_direct
 from warp_reflect.layers import CameraView, GBuffer, ReflectionLayer, eye_ray_direction, eye_ray_origin
 from warp_reflect.normal_maps import prepare_normals
@@ -509,8 +509,8 @@ def arriving(
         (irradiance of distant lights and shapes vec3 [n], length 0 where there are neither shapes nor shadows: the distant
         lights alone are summed where they are used; share of the domes float32 [n], length 0: all of them).
     """
-    direct = wp.zeros(0, dtype=wp.vec3, device=scene.device)
-    sky = wp.zeros(0, dtype=float, device=scene.device)
+    direct = compact.none(wp.vec3, scene.device)
+    sky = compact.none(float, scene.device)
     asked = shadows is not None and scene.triangle_count > 0
     areas = 0 if without_areas else len(scene.lights.direct.areas)
     if not asked and areas == 0:
@@ -532,7 +532,7 @@ def summed_late(scene: Scene, shadows: Shadows | None) -> wp.array:
     kinds = {light.kind for light in scene.data.lights} & set(AREA_KINDS)
     if kinds == {"sphere"} and not (shadows is not None and shadows.direct):
         return scene.lights.direct.areas
-    return wp.zeros(0, dtype=AreaView, device=scene.device)
+    return compact.none(AreaView, scene.device)
 
 
 def seen_radiance(

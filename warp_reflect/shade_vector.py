@@ -10,6 +10,7 @@ from __future__ import annotations
 import warp as wp
 
 from warp_reflect import vector
+from warp_reflect.compact import none
 from warp_reflect.direct import AreaView
 from warp_reflect.direct_vector import SPHERES
 from warp_reflect.hits_vector import HITS
@@ -345,10 +346,6 @@ def shade_blocks_kernel(
     )
 
 
-def _none(dtype, device) -> wp.array:
-    return wp.empty(0, dtype=dtype, device=device)
-
-
 def shade_eye(scene: Scene, gbuffer: GBuffer, light: list, picture: wp.array, mirror: wp.array, threads: int) -> None:
     """What `shade.shade_kernel` does.
 
@@ -356,7 +353,7 @@ def shade_eye(scene: Scene, gbuffer: GBuffer, light: list, picture: wp.array, mi
         light: Light, spheres to sum, looks, normals, direct irradiance, share of the sky, the two roughnesses.
     """
     device = scene.device
-    rays = [_none(wp.vec3, device), _none(float, device), _none(float, device)]
+    rays = [none(wp.vec3, device), none(float, device), none(float, device)]
     inputs = [
         1,
         scene.view,
@@ -367,7 +364,7 @@ def shade_eye(scene: Scene, gbuffer: GBuffer, light: list, picture: wp.array, mi
         gbuffer.reflector_id,
         *rays,
     ]
-    inputs += [picture, mirror, _none(wp.vec3, device)]
+    inputs += [picture, mirror, none(wp.vec3, device)]
     vector.launch_blocks(shade_blocks_kernel, len(gbuffer.triangle), inputs, device, threads)
 
 
@@ -377,6 +374,6 @@ def shade_rays(
     """What `shade.seen_radiance_kernel` does; `light` as in `shade_eye`."""
     device = scene.device
     rays = [layer.pixels.direction, layer.u, layer.v]
-    inputs = [0, scene.view, scene.triangle_records, gbuffer.view, *light, layer.triangle, _none(int, device), *rays]
-    inputs += [_none(wp.vec4, device), _none(wp.vec3, device), radiance]
+    inputs = [0, scene.view, scene.triangle_records, gbuffer.view, *light, layer.triangle, none(int, device), *rays]
+    inputs += [none(wp.vec4, device), none(wp.vec3, device), radiance]
     vector.launch_blocks(shade_blocks_kernel, layer.pixels.count, inputs, device, threads, split_min=HITS_SPLIT_MIN)

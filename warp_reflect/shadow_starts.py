@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from warp_reflect import vector
+from warp_reflect import compact, vector
 from warp_reflect.direct import DirectView, Points, area_irradiance
 from warp_reflect.launch import launch, module_part
 from warp_reflect.ray_walk import ray_offset, scene_facet_normal
@@ -192,7 +192,7 @@ def starts_of(
     """
     device, count = scene.device, len(points.triangle)
     if normals is None:
-        normals = wp.zeros(0, dtype=wp.vec3, device=device)
+        normals = compact.none(wp.vec3, device)
     starts = Starts()
     padded = vector.BLOCK * vector.block_count(count)
     starts.rows = wp.empty((ROWS, padded), dtype=float, device=device)

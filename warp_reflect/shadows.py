@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import warp as wp
 
-from warp_reflect import launch, vector
+from warp_reflect import compact, launch, vector
 from warp_reflect.bvh import TRACE_SPLIT_MIN
 from warp_reflect.direct import (
     CYLINDER,
@@ -556,5 +556,5 @@ def light_shares(
 
 def _arrays(points: Points, normals: wp.array | None, device) -> list:
     if normals is None:
-        normals = wp.zeros(0, dtype=wp.vec3, device=device)
+        normals = compact.none(wp.vec3, device)
     return [points.triangle, points.u, points.v, points.direction, normals]

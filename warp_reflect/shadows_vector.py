@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from warp_reflect import vector
+from warp_reflect import compact, vector
 from warp_reflect.direct import CYLINDER, SPHERE, DirectView
 from warp_reflect.launch import launch
 from warp_reflect.shadow_neighbours import (
@@ -510,7 +510,7 @@ def irradiance(
     """
     device = out_irradiance.device
     first, shared, whole = samples
-    none = wp.zeros(0, dtype=float, device=device)
+    none = compact.none(float, device)
     passes = [(ALL, shared, whole)]
     if len(around.found):
         passes = [(FIRST, 0, first), *([(SHARED, first, shared)] if shared else []), *passes]
@@ -526,15 +526,15 @@ def shares(
     device = out_share.device
     cast = [wp.full(len(kind), 1, dtype=int, device=device) for kind in (lights.distant, lights.areas)]
     inputs = [mesh, lights, *cast, starts, count, 0, samples, Neighbours(), EACH, *CODES]
-    _launch(count, [*inputs, wp.zeros(0, dtype=wp.vec3, device=device), out_share], device, threads)
+    _launch(count, [*inputs, compact.none(wp.vec3, device), out_share], device, threads)
 
 
 def sky_share(mesh: wp.uint64, starts: Starts, count: int, samples: int, out_share: wp.array, threads: int = 0) -> None:
     """As `shadows.sky_share_kernel`."""
     device = out_share.device
-    none = wp.zeros(0, dtype=int, device=device)
+    none = compact.none(int, device)
     inputs = [mesh, DirectView(), none, none, starts, count, 0, samples, Neighbours(), SKY, *CODES]
-    _launch(count, [*inputs, wp.zeros(0, dtype=wp.vec3, device=device), out_share], device, threads)
+    _launch(count, [*inputs, compact.none(wp.vec3, device), out_share], device, threads)
 
 
 def _launch(count: int, inputs: list, device, threads: int) -> None:

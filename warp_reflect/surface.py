@@ -353,7 +353,7 @@ def _met(
     """The surface at some pixels of the picture."""
     n, device = len(pixel), scene.device
     if not n:
-        none = wp.empty(0, dtype=wp.vec3, device=device)
+        none = compact.none(wp.vec3, device)
         return MirrorPixels(reflector, pixel, none, none, none, box)
     mirror = MirrorPixels(
         reflector=reflector,

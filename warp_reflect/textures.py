@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from warp_reflect import launch
+from warp_reflect import compact, launch
 from warp_reflect.cutouts import WRAPS, wrapped_coordinate, wrapped_texel
 from warp_reflect.layers import CameraView, GBuffer, ReflectionLayer, eye_ray_direction, eye_ray_origin
 from warp_reflect.pictures import (
@@ -587,7 +587,7 @@ def prepare_looks(scene: Scene, gbuffer: GBuffer, layer: ReflectionLayer | None,
     """
     textures = scene.textures
     if textures.look_count == 0:
-        return wp.zeros(0, dtype=Look, device=scene.device)
+        return compact.none(Look, scene.device)
     if layer is None:
         looks = wp.zeros(len(gbuffer.triangle), dtype=Look, device=scene.device)
         inputs = [scene.view, gbuffer.view, textures, gbuffer.triangle, looks]

@@ -607,8 +607,8 @@ def behind(
         if patches is None and nearness is None:
             return seen
         total = wp.empty(count, dtype=wp.vec3, device=device) if patches is not None else seen
-        near = wp.empty(0, dtype=float, device=device) if nearness is None else nearness
-        given = patches if patches is not None else wp.empty(0, dtype=int, device=device)
+        near = compact.none(float, device) if nearness is None else nearness
+        given = patches if patches is not None else compact.none(int, device)
         inputs = [interfaces.views, given, layer.triangle, layer.distance, seen]
         launch.launch(met_kernel, count, [*inputs, total, near], device, threads)
         return total
@@ -617,7 +617,7 @@ def behind(
     fading = wp.full(count if interfaces.fades else 0, -1, dtype=int, device=device)
     if interfaces.fades and patches is not None:
         fading = patches
-    way = wp.empty(0, dtype=float, device=device)
+    way = compact.none(float, device)
     near = wp.zeros(count, dtype=wp.vec2, device=device) if nearness is not None else None
     total, first = None, layer
     for depth in range(settings.transparency_depth + 1):

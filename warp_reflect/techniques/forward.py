@@ -386,7 +386,7 @@ def reflect(
             )
     else:
         with timer("own_body"):
-            blocked = wp.zeros(0, dtype=wp.uint8, device=scene.device)
+            blocked = compact.none(wp.uint8, scene.device)
             if not reflector.convex:
                 blocked = bvh.own_obstacles(scene, gbuffer, pixels, reflector.part, settings.threads)
         with timer("refine"):
