@@ -276,18 +276,17 @@ def screen_corner(target: TargetView, v: wp.vec4) -> wp.vec3:
     return wp.vec3(v[0] * inv, v[1] * inv, inv)
 
 
+@wp.struct
+class Clipped:
+    """What is left of a triangle: a convex polygon of homogeneous corners."""
+
+    corners: _polygon
+    count: int  # 0: nothing
+
+
 @wp.func
-def draw_clipped(
-    target: TargetView,
-    a: wp.vec4,
-    b: wp.vec4,
-    c: wp.vec4,
-    plane: PlaneView,
-    triangle: int,
-    row_first: int,
-    row_end: int,
-):
-    """Clip a triangle against the near plane and the guard band in homogeneous space, then draw it as a fan.
+def clip(target: TargetView, a: wp.vec4, b: wp.vec4, c: wp.vec4) -> Clipped:
+    """Clip a triangle against the near plane and the guard band in homogeneous space.
 
     Each crossing is computed from the corner inside to the corner outside, so that two triangles with a common edge
     get bit-equal points on it (Sutherland and Hodgman 1974, with that order fixed).
@@ -317,15 +316,32 @@ def draw_clipped(
         count = kept
         for i in range(count):
             polygon[i] = clipped[i]
-    if count < 3:
-        return
-    corner = screen_corner(target, polygon[0])
-    for i in range(1, count - 1):
+    result = Clipped()
+    result.corners = polygon
+    result.count = wp.where(count < 3, 0, count)
+    return result
+
+
+@wp.func
+def draw_clipped(
+    target: TargetView,
+    a: wp.vec4,
+    b: wp.vec4,
+    c: wp.vec4,
+    plane: PlaneView,
+    triangle: int,
+    row_first: int,
+    row_end: int,
+):
+    """Clip a triangle, then draw it as a fan."""
+    left = clip(target, a, b, c)
+    corner = screen_corner(target, left.corners[0])
+    for i in range(1, left.count - 1):
         draw_triangle(
             target,
             corner,
-            screen_corner(target, polygon[i]),
-            screen_corner(target, polygon[i + 1]),
+            screen_corner(target, left.corners[i]),
+            screen_corner(target, left.corners[i + 1]),
             plane,
             triangle,
             row_first,
