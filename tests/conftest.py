@@ -7,6 +7,7 @@ import importlib
 import os
 import sys
 import tempfile
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -201,6 +202,16 @@ def _compile_once(locks: Path) -> None:
             compile_module(module, device)
 
     launch._compile = compile_alone
+
+
+@pytest.fixture(autouse=True)
+def default_device(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Where arrays lie that a test names no device for: on the one under test if it asks for it, else on the CPU.
+
+    Warp itself would take a GPU wherever there is one.
+    """
+    with wp.ScopedDevice(request.getfixturevalue("device") if "device" in request.fixturenames else "cpu"):
+        yield
 
 
 @pytest.fixture(scope="session", autouse=True)

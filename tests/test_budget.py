@@ -15,6 +15,7 @@ from warp_reflect.budget import (
     BOUNCE_LAYERS,
     BUILT_IN,
     GLOSSY_RAYS,
+    ON_CUDA,
     TRACE_BASE,
     Costs,
     Work,
@@ -226,6 +227,16 @@ def test_dearer_rays_make_a_plan_leave_them(ball_room):
         for ray in (1e-6, 1e3)
     ]
     assert techniques[0] == "raytraced" != techniques[1]
+
+
+def test_a_devices_cheap_rays_are_taken_and_the_plan_says_so(ball_room):
+    """Where a thread whose rays are dear reflects the vertices instead."""
+    dear = dataclasses.replace(BUILT_IN, trace=10.0 * BUILT_IN.trace)
+    here, there = (
+        wr.make_plan(ball_room, None, (640, 360), Settings(threads=1), costs=costs).rows[0] for costs in (dear, ON_CUDA)
+    )
+    assert here.technique != "raytraced" == there.technique
+    assert "pixels are traced in" in there.reason and there.predicted["ms"] < 0.1 * here.predicted["ms"]
 
 
 def test_contradicting_requests_say_which_gave_way(ball_room):

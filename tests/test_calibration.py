@@ -22,14 +22,14 @@ def kept(monkeypatch, tmp_path):
 
 
 def test_kept_costs_come_back_and_plans_go_by_them(kept, device):
-    assert calibration.known(device) == BUILT_IN
+    assert calibration.known(device) == calibration.built_in(device)
     assert calibration.store(OTHER, device) == kept
     assert calibration.known(device) == OTHER
     scene = Scene(room(sphere(), placed(0, 0, 0)).data, device)
     plans = [wr.make_plan(scene, size=(160, 90), method="reference", costs=costs) for costs in (None, OTHER, BUILT_IN)]
     assert plans[0].costs == OTHER and plans[0].predicted == plans[1].predicted != plans[2].predicted
     calibration.store(BUILT_IN, device)
-    assert calibration.known(device) == BUILT_IN
+    assert calibration.known(device) == calibration.built_in(device)
     assert [file.name for file in kept.parent.iterdir()] == [kept.name]  # no temporary is left
 
 
@@ -38,7 +38,7 @@ def test_costs_of_another_machine_or_version_are_not_taken(kept, device, monkeyp
     for name, value in (("processor", lambda: "another"), ("__version__", "0.0")):
         with monkeypatch.context() as changed:
             changed.setattr(calibration, name, value)
-            assert calibration.known(device) == BUILT_IN
+            assert calibration.known(device) == calibration.built_in(device)
             calibration.store(dataclasses.replace(OTHER, layer=1.0), device)
     assert calibration.known(device) == OTHER, "the other machines' costs lie beside it"
     assert len(json.loads(kept.read_text())) == 3
@@ -63,14 +63,14 @@ def test_damaged_costs_are_not_believed(damage, kept, device):
     damage(entry["microseconds"])
     kept.write_text(json.dumps(entries))
     calibration._read.cache_clear()
-    assert calibration.known(device) == BUILT_IN
+    assert calibration.known(device) == calibration.built_in(device)
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"x": 1}', "\x00\xff"])
 def test_files_that_are_none_are_no_calibration_and_are_replaced(text, kept, device):
     kept.parent.mkdir()
     kept.write_text(text)
-    assert calibration.known(device) == BUILT_IN
+    assert calibration.known(device) == calibration.built_in(device)
     calibration.store(OTHER, device)
     assert calibration.known(device) == OTHER
 
@@ -94,7 +94,7 @@ def test_measured_costs_are_of_every_step_and_the_command_keeps_them(kept, devic
     told = capsys.readouterr().out
     assert str(kept) in told and all(each.name in told for each in dataclasses.fields(Costs))
     found = dataclasses.asdict(calibration.known(device))
-    assert calibration.known(device) != BUILT_IN
+    assert calibration.known(device) != calibration.built_in(device)
     assert all(value > 0.0 for value in found.values())
 
 

@@ -80,6 +80,36 @@ class Costs:
 
 
 BUILT_IN = Costs()
+# Likewise of a CUDA device, all of its threads together: an NVIDIA H100. The host's part, a launch after the other, is `layer`.
+ON_CUDA = Costs(
+    trace=0.005,
+    mirrored=0.0005,
+    quadric_cold=0.0015,
+    quadric_warm=0.0007,
+    map_cold=0.002,
+    map_warm=0.001,
+    branches=0.05,
+    bent=0.002,
+    cut=0.002,
+    draw=0.002,
+    covered=0.0005,
+    interpolated=0.002,
+    candidate=0.0002,
+    refined=0.0004,
+    own_body=0.002,
+    looked_up=0.0003,
+    map_texel=0.001,
+    map_triangle=0.0005,
+    blended=0.0005,
+    followed=0.0008,
+    eye_triangle=0.002,
+    eye_pixel=0.0006,
+    mirror_pixel=0.0006,
+    gathered=0.01,
+    through=0.01,
+    shadow=0.0015,
+    layer=450.0,
+)
 TRACE_BASE = 65536  # triangles at which `Costs.trace` is told
 # A mirror's own rays go through the tree side by side, the cheaper the more of them meet the same triangles: at least this
 # share of `Costs.trace`, and more by the root of triangles per mirror pixel. Measured on this package's scenes, 5 * 10^3 to

@@ -17,7 +17,8 @@ from collections.abc import Callable
 import numpy as np
 import warp as wp
 
-from warp_reflect.budget import BUILT_IN, GLOSSY_RAYS, TRACE_BASE, Costs, packed
+from warp_reflect.budget import GLOSSY_RAYS, TRACE_BASE, Costs, packed
+from warp_reflect.calibration import built_in
 from warp_reflect.frame import Frame, render_frame
 from warp_reflect.launch import thread_count
 from warp_reflect.planner import Plan, make_plan
@@ -38,6 +39,10 @@ from warp_reflect.timing import counted_by
 
 SIZE = (480, 270)
 SMALL = (160, 90)  # the same with few pixels
+FEW = (16, 9)  # with next to none
+DEVICE_SIDES = (
+    6  # times as long on a CUDA device, pictures' and walls' (in cells): launches alone take a millisecond there
+)
 REPEATS = 3  # the middle one of three frames counts
 ROWS = 24  # of a ball's facets, from pole to pole
 WALL_CELLS = 48  # along a side of each of six walls
@@ -73,9 +78,9 @@ def _measure(device: str, repeats: int, told: Callable[[str], None]) -> Costs:
     ball, wall, hollow = (_scene(kind, device) for kind in ("ball", "wall", "hollow"))
     told("rays")
     traced = _timed(ball, "reference", repeats)
-    ray = traced.us("reflect") / traced.pixels
+    few = _timed(ball, "reference", repeats, size=FEW)
+    ray = (traced.us("reflect") - few.us("reflect")) / (traced.pixels - few.pixels)
     found["trace"] = ray / packed(ball.triangle_count, traced.pixels)
-    few = _timed(ball, "reference", repeats, size=(16, 9))
     found["layer"] = max(few.us("reflect") - few.pixels * ray, 1.0)
     told("quadrics and maps")
     for name, technique in (("quadric", "quadric"), ("map", "reflector_map")):
@@ -131,7 +136,8 @@ def _measure(device: str, repeats: int, told: Callable[[str], None]) -> Costs:
     pane = _timed(_scene("pane", device), "none", repeats)
     found["through"] = pane.us("transmission") / pane.panes
     found["sharing"] = _sharing(ball, device, repeats, traced)
-    return Costs(**{name: _likely(name, value) for name, value in found.items()})
+    usual = built_in(device)
+    return dataclasses.replace(usual, **{name: _likely(value, getattr(usual, name)) for name, value in found.items()})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -161,7 +167,9 @@ class _Measured:
 
 def _timed(scene: Scene, method: str, repeats: int, warm: bool = False, size=SIZE, threads: int = 1, **settings):
     asked = Settings(threads=threads, keep_static=False, environment_px=0.0, **settings)
-    plan = make_plan(scene, None, size, asked, method, costs=BUILT_IN)
+    if size != FEW:
+        size = tuple(side * _sides(scene.device) for side in size)
+    plan = make_plan(scene, None, size, asked, method, costs=built_in(scene.device))
     render_frame(scene, plan)  # kernels, and what a scene makes once
     frames: list[Frame] = []
     for k in range(repeats):
@@ -186,6 +194,10 @@ def _timed(scene: Scene, method: str, repeats: int, warm: bool = False, size=SIZ
     )
 
 
+def _sides(device: wp.DeviceLike) -> int:
+    return DEVICE_SIDES if wp.get_device(device).is_cuda else 1
+
+
 def _drawn(small: _Measured, large: _Measured) -> tuple[float, float]:
     """What a virtual triangle and a mirror pixel cost to draw, from pictures of two sizes."""
     counts = np.array([[each.triangles, each.pixels] for each in (small, large)], np.float64)
@@ -203,15 +215,14 @@ def _sharing(scene: Scene, device: str, repeats: int, alone: _Measured) -> float
     """Of a further thread, how much it adds to the first, by rays."""
     threads = thread_count(device)
     if threads < 2:
-        return BUILT_IN.sharing
+        return built_in(device).sharing
     together = _timed(scene, "reference", repeats, threads=threads)
     speed = alone.us("reflect") / max(together.us("reflect"), 1e-9)
     return min(max((speed - 1.0) / (threads - 1), 0.05), 1.0)
 
 
-def _likely(name: str, value: float) -> float:
+def _likely(value: float, usual: float) -> float:
     """A cost no further from the built-in one than a disturbed difference of two times can bring it."""
-    usual = getattr(BUILT_IN, name)
     return min(max(float(value), 0.01 * usual), 100.0 * usual)
 
 
@@ -220,7 +231,7 @@ def _likely(name: str, value: float) -> float:
 
 def _scene(kind: str, device: wp.DeviceLike) -> Scene:
     """A mirror in a room among balls: a sphere, a rough one, a square, or a bowl; a pane; or the room with a lamp."""
-    mesh, where, cells, balls = ball(analytic=True), _placed(0.0, 0.0, 0.0), WALL_CELLS, BALLS
+    mesh, where, cells, balls = ball(analytic=True), _placed(0.0, 0.0, 0.0), WALL_CELLS * _sides(device), BALLS
     camera, lights, material = _placed(0.1, 0.3, 4.0), [], CHROME
     if kind == "rough":
         material = dataclasses.replace(CHROME, roughness=ROUGHNESS)

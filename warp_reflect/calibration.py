@@ -15,7 +15,7 @@ from pathlib import Path
 import warp as wp
 
 from warp_reflect import __version__
-from warp_reflect.budget import BUILT_IN, Costs
+from warp_reflect.budget import BUILT_IN, ON_CUDA, Costs
 from warp_reflect.devices import processor
 
 # Environment variable: the file itself, in place of the one in the user's cache; empty: none, the built-in costs.
@@ -51,16 +51,21 @@ def identity(device: wp.DeviceLike) -> dict[str, str | int]:
     }
 
 
+def built_in(device: wp.DeviceLike) -> Costs:
+    """The costs of a device of this kind."""
+    return ON_CUDA if wp.get_device(device).is_cuda else BUILT_IN
+
+
 def known(device: wp.DeviceLike) -> Costs:
-    """The costs that were measured for a device on this machine with these versions; `budget.BUILT_IN` where none were."""
-    file = cache_file()
+    """The costs that were measured for a device on this machine with these versions; `built_in` where none were."""
+    file, usual = cache_file(), built_in(device)
     if file is None:
-        return BUILT_IN
+        return usual
     try:
         changed = file.stat().st_mtime_ns
     except OSError:
-        return BUILT_IN
-    return _read(file, changed, _key(identity(device))) or BUILT_IN
+        return usual
+    return _read(file, changed, _key(identity(device)), usual) or usual
 
 
 def check_writable() -> Path:
@@ -105,11 +110,12 @@ def described(device: wp.DeviceLike) -> str:
     return f"{this['processor']}, {this['cores']} cores, {this['device']}, Warp {this['warp']}"
 
 
-def table(costs: Costs) -> str:
-    """Costs beside the built-in ones, a line each."""
-    lines = [f"{'step':14s} {'here':>10s} {'built in':>10s}  microseconds of one thread (sharing: of a further thread)"]
+def table(costs: Costs, device: wp.DeviceLike) -> str:
+    """Costs beside a device's built-in ones, a line each."""
+    usual, whose = built_in(device), "the device" if wp.get_device(device).is_cuda else "one thread"
+    lines = [f"{'step':14s} {'here':>10s} {'built in':>10s}  microseconds of {whose} (sharing: of a further thread)"]
     for each in dataclasses.fields(Costs):
-        lines.append(f"{each.name:14s} {getattr(costs, each.name):10.4g} {getattr(BUILT_IN, each.name):10.4g}")
+        lines.append(f"{each.name:14s} {getattr(costs, each.name):10.4g} {getattr(usual, each.name):10.4g}")
     return "\n".join(lines)
 
 
@@ -127,16 +133,15 @@ def _entries(file: Path) -> dict:
 
 
 @cache
-def _read(file: Path, changed: int, key: str) -> Costs | None:
+def _read(file: Path, changed: int, key: str, usual: Costs) -> Costs | None:
     """The costs under a key; None where they are not there, or one of them cannot be."""
     entry = _entries(file).get(key)
     found = entry.get("microseconds") if isinstance(entry, dict) else None
     if not isinstance(found, dict) or found.keys() != dataclasses.asdict(BUILT_IN).keys():
         return None
-    return Costs(**found) if all(_is_likely(name, value) for name, value in found.items()) else None
+    return Costs(**found) if all(_is_likely(value, getattr(usual, name)) for name, value in found.items()) else None
 
 
-def _is_likely(name: str, value: object) -> bool:
-    usual = getattr(BUILT_IN, name)
+def _is_likely(value: object, usual: float) -> bool:
     number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
     return number and FACTORS[0] * usual <= value <= FACTORS[1] * usual

@@ -526,7 +526,8 @@ def calibrate(*, device: str = "cpu", repeats: int = 3, debug: Annotated[bool, P
     """Measure in half a minute what the steps of a frame cost on this machine, and keep it for plans to choose by.
 
     Kept in the user's cache for this processor, device and version, or in the file that the environment variable
-    WARP_REFLECT_CALIBRATION names (empty: nowhere). Without it, plans go by the costs of a server core of 2026.
+    WARP_REFLECT_CALIBRATION names (empty: nowhere). Without it, plans go by the costs of a server core of 2026, or of
+    an NVIDIA H100.
 
     Args:
         device: cpu or cuda:0.
@@ -550,7 +551,7 @@ def calibrate(*, device: str = "cpu", repeats: int = 3, debug: Annotated[bool, P
 
         costs = measure(device, repeats, tell)
     file = calibration.store(costs, device)
-    print(calibration.table(costs))
+    print(calibration.table(costs, device))
     print(f"{file}: kept for {calibration.described(device)}")
     return DONE
 
