@@ -157,10 +157,14 @@ def launch(
     if count <= 0:
         return
     _record(kernel, count)
+    device = wp.get_device(device)
+    if device.is_cuda:
+        wp.launch(kernel, dim=count, inputs=[0, *inputs], device=device, block_dim=CUDA_BLOCK_DIM)
+        return
     _load(kernel, device)
     parts = shared_by(count, device, threads, split_min)
     if parts == 1:
-        wp.launch(kernel, dim=count, inputs=[0, *inputs], device=device, **_blocks(device))
+        wp.launch(kernel, dim=count, inputs=[0, *inputs], device=device)
         return
     # The arguments are checked and packed once; each thread has its own copy of them, but for the slice.
     packed = wp.launch(kernel, dim=count, inputs=[0, *inputs], device=device, record_cmd=True)
@@ -192,10 +196,6 @@ def few_registers(kernel: wp.Kernel) -> wp.Kernel:
     """A decorator over `wp.kernel`'s: on CUDA a thread gets at most `MOST_REGISTERS`; versions of Warp that cannot ignore it."""
     kernel.options["cuda_max_registers"] = MOST_REGISTERS
     return kernel
-
-
-def _blocks(device) -> dict[str, int]:
-    return {"block_dim": CUDA_BLOCK_DIM} if wp.get_device(device).is_cuda else {}
 
 
 def launch_bands(kernel, count: int, bands: list[tuple[int, int]], inputs: list, device) -> None:
@@ -239,8 +239,6 @@ def ready(modules: Iterable[wp.Module], device) -> list[Future]:
 def _load(kernel, device) -> None:
     # The module must be compiled and loaded before threads race for it.
     device = wp.get_device(device)
-    if not device.is_cpu:
-        return
     loading = _begun(kernel.module, device)
     if not loading.done():
         start = perf_counter()
