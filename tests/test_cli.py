@@ -521,10 +521,21 @@ def test_cut_kernels_are_compiled_again_in_one_start(cached_module, device):
     assert devices.heal_kernel_cache(cached_module.parent) == []
 
 
+KEEP = """
+from pathlib import Path
+import warp as wp
+from warp_reflect import devices
+devices.open_device("cpu")
+Path(wp.config.kernel_cache_dir, "kernel").mkdir()
+Path(wp.config.kernel_cache_dir, "kernel", "kernel.o").write_text("compiled")
+print(wp.config.kernel_cache_dir)
+"""
+
+
 def test_cache_folder_that_cannot_be_made_is_replaced_for_the_run(tmp_path):
     (tmp_path / "file").write_text("")
     (tmp_path / "temporary").mkdir()
-    done = python(LOAD, WARP_CACHE_PATH=str(tmp_path / "file"), TMPDIR=str(tmp_path / "temporary"))
+    done = python(KEEP, WARP_CACHE_PATH=str(tmp_path / "file"), TMPDIR=str(tmp_path / "temporary"))
     assert done.returncode == 0, done.stderr
     assert Path(done.stdout.strip()).is_relative_to(tmp_path / "temporary")
     assert list((tmp_path / "temporary").iterdir()) == []

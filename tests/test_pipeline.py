@@ -522,16 +522,16 @@ def test_scheduler_that_is_not_there_is_one_line_and_2(render, monkeypatch):
     assert not contents()
 
 
-@pytest.mark.parametrize("address", ["nonsense", "tcp://host", "tcp://host:port", "foo://host:8786"])
-def test_scheduler_address_that_is_none_is_one_line_and_2(stage, device, address):
+def test_scheduler_address_that_is_none_is_one_line_and_2(stage, device):
     # In a process of its own: what is complained of at its end counts, too.
-    command = [sys.executable, "-m", "warp_reflect.cli", "render", stage, "a.#.exr", "-f", "1:3", *SMALL]
-    done = subprocess.run(
-        [*command, "--device", device, "--scheduler", address], capture_output=True, text=True, check=False
-    )
+    addresses = ["nonsense", "tcp://host", "tcp://host:port", "foo://host:8786"]
+    command = ["render", stage, "a.#.exr", "-f", "1:3", *SMALL, "--device", device, "--scheduler"]
+    script = f"from warp_reflect import cli\nprint([cli.main([*{command}, address]) for address in {addresses}])"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     told = done.stderr.splitlines()
-    assert (done.returncode, done.stdout, len(told)) == (2, "", 1)
-    assert told[0].startswith(f"error: --scheduler: got '{address}', expected an address as tcp://host:8786")
+    assert (done.returncode, done.stdout, len(told)) == (0, "[2, 2, 2, 2]\n", 4)
+    for address, line in zip(addresses, told, strict=True):
+        assert line.startswith(f"error: --scheduler: got '{address}', expected an address as tcp://host:8786")
 
 
 def test_missing_dask_is_one_line_that_names_the_extra(render, monkeypatch):

@@ -58,8 +58,13 @@ def loaded(name: str, device: str) -> wr.Scene:
     return wr.load_stage(str(FOLDER / f"{name}.usda"), device=device)
 
 
-@functools.cache
 def rendered(name: str, device: str, method: str, threads: int = 0, size: tuple[int, int] = SIZE) -> wr.Frame:
+    return frame_of(name, device, method, threads, size)
+
+
+@functools.cache
+def frame_of(name: str, device: str, method: str, threads: int, size: tuple[int, int]) -> wr.Frame:
+    """Without defaults: calls that give them and calls that leave them out would each be rendered."""
     scene = loaded(name, device)
     plan = wr.make_plan(scene, size=size, settings=wr.Settings(threads=threads, keep_static=False), method=method)
     return wr.render_frame(scene, plan)

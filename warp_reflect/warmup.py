@@ -65,7 +65,10 @@ def warm_all(device: wp.DeviceLike, threads: int = 0) -> tuple[list[str], float]
 def kernel_modules() -> Iterator[str]:
     """Names of the package's modules that define kernels, without importing them."""
     for path in sorted(PACKAGE.rglob("*.py")):
-        functions = (node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.FunctionDef))
+        text = path.read_text()
+        if "wp.kernel" not in text:  # most: a text is searched in no time, and parsed in 10 ms
+            continue
+        functions = (node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.FunctionDef))
         if any(ast.unparse(mark).startswith("wp.kernel") for each in functions for mark in each.decorator_list):
             yield ".".join((PACKAGE.name, *path.relative_to(PACKAGE).with_suffix("").parts))
 
