@@ -263,6 +263,17 @@ def test_frames_needed_are_the_one_before_or_a_run():
 # The stage's identity.
 
 
+def test_a_stage_that_names_a_pipe_is_known_without_reading_it(tmp_path):
+    os.mkfifo(tmp_path / "pipe.png")
+    path = tmp_path / "stage.usda"
+    path.write_text('#usda 1.0\ndef "A"\n{\n    asset picture = @./pipe.png@\n}\n')
+    known = []
+    reading = threading.Thread(target=lambda: known.append(stage_digest(path)), daemon=True)
+    reading.start()
+    reading.join(60.0)  # to read a pipe that nobody writes to would take for ever
+    assert [len(digest) for digest in known] == [32]
+
+
 def test_stage_is_known_by_the_contents_of_all_its_files(stage, tmp_path):
     first = stage_digest(stage)
     assert stage_digest(stage, untrusted=True) == first

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import stat
 import subprocess
 import sys
 from pathlib import Path
@@ -69,6 +70,9 @@ def _digest(path: str, root: str) -> str:
             raise ValueError(f"cannot read {path}: the file {file} is {fault}")
         total.update(os.path.relpath(file, folder).encode())
         try:
+            if not stat.S_ISREG(os.stat(file).st_mode):  # a pipe or a device: read, it might have no end
+                total.update(b"no file")
+                continue
             with open(file, "rb") as stream:
                 total.update(hashlib.file_digest(stream, "blake2b").digest())
         except OSError as fault:
