@@ -33,28 +33,28 @@ def project_to_cube(x: wp.vec3) -> wp.vec3:
     m = max_abs(x)
     if m == 0.0:
         return wp.vec3(1.0, 0.0, 0.0)
-    return x / m
+    return x * (1.0 / m)
 
 
 @wp.func
 def cube_point(x: wp.vec3) -> CubePoint:
-    """Face and position of a direction (any length but zero)."""
+    """Face and position of a point of the cube, whose largest component is 1."""
     point = CubePoint()
     ax = wp.abs(x[0])
     ay = wp.abs(x[1])
     az = wp.abs(x[2])
     if ax >= ay and ax >= az:
         point.face = wp.where(x[0] < 0.0, 1, 0)
-        point.u = x[1] / ax
-        point.v = x[2] / ax
+        point.u = x[1]
+        point.v = x[2]
     elif ay >= az:
         point.face = wp.where(x[1] < 0.0, 3, 2)
-        point.u = x[2] / ay
-        point.v = x[0] / ay
+        point.u = x[2]
+        point.v = x[0]
     else:
         point.face = wp.where(x[2] < 0.0, 5, 4)
-        point.u = x[0] / az
-        point.v = x[1] / az
+        point.u = x[0]
+        point.v = x[1]
     return point
 
 

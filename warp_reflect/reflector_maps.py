@@ -42,6 +42,15 @@ class ReflectorMapView:
 
 
 @wp.struct
+class MapCell:
+    """Where a cube point lies: its first texel of four, and the place between them, 0 to 1 each way."""
+
+    texel: int
+    a: float
+    b: float
+
+
+@wp.struct
 class MapSample:
     """Surface at a cube point, with derivatives per texel along the face's axes.
 
@@ -49,6 +58,7 @@ class MapSample:
     tangent leaves out.
     """
 
+    cell: MapCell
     p: wp.vec3
     p_u: wp.vec3
     p_v: wp.vec3
@@ -73,13 +83,24 @@ def nearest_texel(map: ReflectorMapView, x: wp.vec3) -> int:
 
 
 @wp.func
-def least_mask(map: ReflectorMapView, x: wp.vec3) -> float:
-    """The least mask of the four texels around a cube point: 0 on the closing part and across its border."""
+def map_cell(map: ReflectorMapView, x: wp.vec3) -> MapCell:
     c = cube_point(x)
     scale = 0.5 * float(map.resolution - 1)
-    i = wp.clamp(int((c.u + 1.0) * scale), 0, map.resolution - 2)
-    j = wp.clamp(int((c.v + 1.0) * scale), 0, map.resolution - 2)
-    t = texel_index(map, c.face, j, i)
+    fu = (c.u + 1.0) * scale
+    fv = (c.v + 1.0) * scale
+    i = wp.clamp(int(fu), 0, map.resolution - 2)
+    j = wp.clamp(int(fv), 0, map.resolution - 2)
+    cell = MapCell()
+    cell.texel = texel_index(map, c.face, j, i)
+    cell.a = fu - float(i)
+    cell.b = fv - float(j)
+    return cell
+
+
+@wp.func
+def least_mask(map: ReflectorMapView, x: wp.vec3) -> float:
+    """The least mask of the four texels around a cube point: 0 on the closing part and across its border."""
+    t = map_cell(map, x).texel
     below = t + 2 * map.resolution
     return wp.min(
         wp.min(map.texels[t][3], map.texels[t + 2][3]), wp.min(map.texels[below][3], map.texels[below + 2][3])
@@ -94,15 +115,10 @@ def xyz(v: wp.vec4) -> wp.vec3:
 @wp.func
 def sample_map(map: ReflectorMapView, x: wp.vec3) -> MapSample:
     """Bilinear position, normal and their derivatives at a cube point (4 texels)."""
-    c = cube_point(x)
-    scale = 0.5 * float(map.resolution - 1)
-    fu = (c.u + 1.0) * scale
-    fv = (c.v + 1.0) * scale
-    i = wp.clamp(int(fu), 0, map.resolution - 2)
-    j = wp.clamp(int(fv), 0, map.resolution - 2)
-    a = fu - float(i)
-    b = fv - float(j)
-    t00 = texel_index(map, c.face, j, i)
+    cell = map_cell(map, x)
+    a = cell.a
+    b = cell.b
+    t00 = cell.texel
     t10 = t00 + 2 * map.resolution
     p00 = xyz(map.texels[t00])
     n00 = xyz(map.texels[t00 + 1])
@@ -117,6 +133,7 @@ def sample_map(map: ReflectorMapView, x: wp.vec3) -> MapSample:
     n_low = n00 + a * (n01 - n00)
     n_high = n10 + a * (n11 - n10)
     s = MapSample()
+    s.cell = cell
     s.p_v = p_high - p_low
     s.p_u = (1.0 - b) * (p01 - p00) + b * (p11 - p10)
     s.p = p_low + b * s.p_v
@@ -127,6 +144,16 @@ def sample_map(map: ReflectorMapView, x: wp.vec3) -> MapSample:
     s.n_v = inv * raw_v
     s.n_u = inv * ((1.0 - b) * (n01 - n00) + b * (n11 - n10))
     return s
+
+
+@wp.func
+def slide(s: MapSample, along_u: float, along_v: float) -> MapSample:
+    """Position and normal a part of a texel on, from the same four texels, but for their twist: along_u along_v of it."""
+    moved = MapSample()
+    moved.p = s.p + along_u * s.p_u + along_v * s.p_v
+    raw = s.n + along_u * s.n_u + along_v * s.n_v
+    moved.n = raw * (1.0 / wp.max(wp.length(raw), 1.0e-20))
+    return moved
 
 
 @dataclass(frozen=True)

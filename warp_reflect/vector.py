@@ -113,24 +113,27 @@ _HEAD = r"""
         high = __builtin_shufflevector(a, b, 1, 3, 5, 7, 9, 11, 13, 15);
 #endif
     };
-    // Eight floats at p[start[l]] of every lane, as eight vectors: whole rows are read and transposed.
+    // Eight floats at p[start[l]] of every lane, as eight vectors. Halves of rows are read into place, so that what is left to
+    // transpose crosses no half of a vector.
     typedef float Row __attribute__((ext_vector_type(8)));
+    typedef float HalfRow __attribute__((ext_vector_type(4)));
     auto transposed = [](const float* p, const int* start, Row* out) {
-        Row r[8], s[8];
-        _Pragma("clang loop unroll(full)") for (int k = 0; k < 8; ++k) __builtin_memcpy(&r[k], p + start[k], sizeof(Row));
-        _Pragma("clang loop unroll(full)") for (int k = 0; k < 8; k += 2) {
-            s[k] = __builtin_shufflevector(r[k], r[k + 1], 0, 8, 1, 9, 4, 12, 5, 13);
-            s[k + 1] = __builtin_shufflevector(r[k], r[k + 1], 2, 10, 3, 11, 6, 14, 7, 15);
-        }
-        _Pragma("clang loop unroll(full)") for (int k = 0; k < 8; k += 4) {
-            r[k] = __builtin_shufflevector(s[k], s[k + 2], 0, 1, 8, 9, 4, 5, 12, 13);
-            r[k + 1] = __builtin_shufflevector(s[k], s[k + 2], 2, 3, 10, 11, 6, 7, 14, 15);
-            r[k + 2] = __builtin_shufflevector(s[k + 1], s[k + 3], 0, 1, 8, 9, 4, 5, 12, 13);
-            r[k + 3] = __builtin_shufflevector(s[k + 1], s[k + 3], 2, 3, 10, 11, 6, 7, 14, 15);
-        }
-        _Pragma("clang loop unroll(full)") for (int k = 0; k < 4; ++k) {
-            out[k] = __builtin_shufflevector(r[k], r[k + 4], 0, 1, 2, 3, 8, 9, 10, 11);
-            out[k + 4] = __builtin_shufflevector(r[k], r[k + 4], 4, 5, 6, 7, 12, 13, 14, 15);
+        _Pragma("clang loop unroll(full)") for (int half = 0; half < 8; half += 4) {
+            Row r[4];
+            _Pragma("clang loop unroll(full)") for (int k = 0; k < 4; ++k) {
+                HalfRow a, b;
+                __builtin_memcpy(&a, p + start[k] + half, sizeof(a));
+                __builtin_memcpy(&b, p + start[k + 4] + half, sizeof(b));
+                r[k] = __builtin_shufflevector(a, b, 0, 1, 2, 3, 4, 5, 6, 7);
+            }
+            const Row s = __builtin_shufflevector(r[0], r[1], 0, 8, 1, 9, 4, 12, 5, 13);
+            const Row t = __builtin_shufflevector(r[2], r[3], 0, 8, 1, 9, 4, 12, 5, 13);
+            const Row u = __builtin_shufflevector(r[0], r[1], 2, 10, 3, 11, 6, 14, 7, 15);
+            const Row v = __builtin_shufflevector(r[2], r[3], 2, 10, 3, 11, 6, 14, 7, 15);
+            out[half] = __builtin_shufflevector(s, t, 0, 1, 8, 9, 4, 5, 12, 13);
+            out[half + 1] = __builtin_shufflevector(s, t, 2, 3, 10, 11, 6, 7, 14, 15);
+            out[half + 2] = __builtin_shufflevector(u, v, 0, 1, 8, 9, 4, 5, 12, 13);
+            out[half + 3] = __builtin_shufflevector(u, v, 2, 3, 10, 11, 6, 7, 14, 15);
         }
     };
     auto gather8 = [transposed](const float* p, I start, F* out) {

@@ -12,7 +12,7 @@ from warp_reflect.layers import CameraView
 from warp_reflect.reflector_maps import ReflectorMapView
 from warp_reflect.techniques.interpolation import CONVERGED, HIDDEN, RESIDUAL_MAX, ChunkView
 from warp_reflect.techniques.lanes import REFLECTOR_MAP, VIRTUAL_VERTEX
-from warp_reflect.techniques.map_search import ACCEPTED, NORMAL_PART_MIN, SPD_SHARE, STEP_CAP
+from warp_reflect.techniques.map_search import ACCEPTED, CONVEX_SHARE, DET_MIN, NORMAL_PART_MIN, SPD_SHARE, STEP_CAP
 from warp_reflect.techniques.vertices import ESTIMATE, SolveFrame, VertexView
 
 wp.set_module_options({"enable_backward": False})
@@ -100,6 +100,8 @@ def step_chunk(
     tolerance: float,
     residual_max: float,
     normal_part_min: float,
+    convex_share: float,
+    det_min: float,
     spd_share: float,
     step_cap: float,
     accepted: float,
@@ -138,6 +140,8 @@ def direction_lanes_kernel(
         tolerance,
         RESIDUAL_MAX,
         NORMAL_PART_MIN,
+        CONVEX_SHARE,
+        DET_MIN,
         SPD_SHARE,
         STEP_CAP,
         ACCEPTED,

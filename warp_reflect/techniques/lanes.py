@@ -124,20 +124,20 @@ REFLECTOR_MAP = r"""
     const float* texels = (const float*)map.texels.data;
     const int resolution = map.resolution;
     const float scale = 0.5f * (float)(resolution - 1);
-    struct Sample { V p, p_u, p_v, n, n_u, n_v; F mask; };
     struct Law { F residual, cos_eye, cos_target; };
     // cubemap.project_to_cube
     auto project_to_cube = [&](V x) -> V {
         const F m = size(x);
-        return vpick(m == 0.0f, V{F(1.0f), F(0.0f), F(0.0f)}, over(x, m));
+        return vpick(m == 0.0f, V{F(1.0f), F(0.0f), F(0.0f)}, times(1.0f / m, x));
     };
     auto whole = [&](F f) -> I {
         I i = __builtin_convertvector(f, I);
         i = ipick(i < 0, I(0), i);
         return ipick(i > resolution - 2, I(resolution - 2), i);
     };
-    // Of a cube point, whose largest component is 1: `cubemap.cube_point` without its divisions.
-    auto sample = [&](V x) -> Sample {
+    // reflector_maps.map_cell
+    struct Cell { I texel; F a, b; };
+    auto map_cell = [&](V x) -> Cell {
         const F ax = magnitude(x.x), ay = magnitude(x.y), az = magnitude(x.z);
         const I on_x = (ax >= ay) & (ax >= az), on_y = ay >= az;
         const F major = pick(on_x, x.x, pick(on_y, x.y, x.z));
@@ -145,8 +145,13 @@ REFLECTOR_MAP = r"""
         const I face = ipick(on_x, I(0), ipick(on_y, I(2), I(4))) - (major < 0.0f);
         const F fu = (u + 1.0f) * scale, fv = (v + 1.0f) * scale;
         const I i = whole(fu), j = whole(fv);
-        const F a = fu - __builtin_convertvector(i, F), b = fv - __builtin_convertvector(j, F);
-        const I at = 8 * ((face * resolution + j) * resolution + i);
+        return Cell{8 * ((face * resolution + j) * resolution + i),
+            fu - __builtin_convertvector(i, F), fv - __builtin_convertvector(j, F)};
+    };
+    struct Sample { V p, p_u, p_v, n, n_u, n_v; F mask; Cell cell; };
+    auto sample_cell = [&](const Cell& cell) -> Sample {
+        const I at = cell.texel;
+        const F a = cell.a, b = cell.b;
         F t00[8], t01[8], t10[8], t11[8];
         gather8(texels, at, t00);
         gather8(texels + 8, at, t01);
@@ -162,6 +167,7 @@ REFLECTOR_MAP = r"""
             by_u = add(times(1.0f - b, d0), times(b, d1));
         };
         Sample s;
+        s.cell = cell;
         V raw, n_u, n_v;
         between(0, s.p, s.p_u, s.p_v);
         between(4, raw, n_u, n_v);
@@ -173,6 +179,15 @@ REFLECTOR_MAP = r"""
         s.mask = fmin(fmin(t00[3], t01[3]), fmin(t10[3], t11[3]));
         return s;
     };
+    auto sample = [&](V x) -> Sample { return sample_cell(map_cell(x)); };
+    // reflector_maps.slide
+    auto slide = [&](const Sample& s, F along_u, F along_v) -> Sample {
+        Sample moved;
+        moved.p = add(add(s.p, times(along_u, s.p_u)), times(along_v, s.p_v));
+        const V raw = add(add(s.n, times(along_u, s.n_u)), times(along_v, s.n_v));
+        moved.n = times(1.0f / fmax(length(raw), F(1.0e-20f)), raw);
+        return moved;
+    };
     auto measure = [&](const Sample& s, V target) -> Law {
         const V to_eye = sub(eye, s.p), to_target = sub(target, s.p);
         const V o = times(1.0f / fmax(length(to_eye), F(1.0e-20f)), to_eye);
@@ -183,43 +198,44 @@ REFLECTOR_MAP = r"""
         law.cos_target = dot(s.n, v);
         const F w_n = law.cos_eye + law.cos_target;
         const F w_t = length(sub(w, times(w_n, s.n)));
-        law.residual = pick(w_n > normal_part_min, w_t / w_n, 1.0e4f - w_n);
+        law.residual = pick(w_n > normal_part_min, w_t * (1.0f / w_n), 1.0e4f - w_n);
         return law;
     };
     auto newton_step = [&](const Sample& s, V target) -> V {
         const V to_eye = sub(eye, s.p), to_target = sub(target, s.p);
         const F inv_o = 1.0f / fmax(length(to_eye), F(1.0e-20f)), inv_v = 1.0f / fmax(length(to_target), F(1.0e-20f));
         const V o = times(inv_o, to_eye), v = times(inv_v, to_target), n = s.n;
-        V t1, t2;
-        tangents(n, t1, t2);
-        const F o1 = dot(t1, o), o2 = dot(t2, o), v1 = dot(t1, v), v2 = dot(t2, v);
         const F n_o = dot(n, o), n_v = dot(n, v), w_n = n_o + n_v;
-        const F a11 = dot(t1, s.p_u), a12 = dot(t1, s.p_v), a21 = dot(t2, s.p_u), a22 = dot(t2, s.p_v);
-        const F b11 = dot(t1, s.n_u), b12 = dot(t1, s.n_v), b21 = dot(t2, s.n_u), b22 = dot(t2, s.n_v);
-        const F det_p = a11 * a22 - a12 * a21;
-        const F inv_p = pick(magnitude(det_p) > 1.0e-20f, 1.0f / det_p, F(0.0f));
-        const F s11 = fmax((b11 * a22 - b12 * a21) * inv_p, F(0.0f));
-        const F s22 = fmax((b22 * a11 - b21 * a12) * inv_p, F(0.0f));
-        const F bound = root(s11 * s22);
-        const F s12 = fmin(fmax(0.5f * ((b12 * a11 - b11 * a12) + (b21 * a22 - b22 * a21)) * inv_p, -bound), bound);
-        const F k = fmax(w_n, F(0.0f));
-        const F h11 = (1.0f - o1 * o1) * inv_o + (1.0f - v1 * v1) * inv_v + k * s11;
-        const F h22 = (1.0f - o2 * o2) * inv_o + (1.0f - v2 * v2) * inv_v + k * s22;
-        const F h12 = -o1 * o2 * inv_o - v1 * v2 * inv_v + k * s12;
+        const V w_t = sub(add(o, v), times(w_n, n));
+        const F n_1 = dot(n, s.p_u), n_2 = dot(n, s.p_v);
+        const F o1 = dot(o, s.p_u) - n_o * n_1, o2 = dot(o, s.p_v) - n_o * n_2;
+        const F v1 = dot(v, s.p_u) - n_v * n_1, v2 = dot(v, s.p_v) - n_v * n_2;
+        const F e = dot(s.p_u, s.p_u) - n_1 * n_1, f = dot(s.p_u, s.p_v) - n_1 * n_2, g = dot(s.p_v, s.p_v) - n_2 * n_2;
+        const F s11 = fmax(dot(s.n_u, s.p_u), F(0.0f)), s22 = fmax(dot(s.n_v, s.p_v), F(0.0f));
+        F s12 = 0.5f * (dot(s.n_u, s.p_v) + dot(s.n_v, s.p_u));
+        const I bent = s12 * s12 > convex_share * (s11 * s22);
+        if (bits(bent)) {
+            const F bound = root(s11 * s22);
+            s12 = pick(bent, fmin(fmax(s12, -bound), bound), s12);
+        }
+        const F k = fmax(w_n, F(0.0f)), both = inv_o + inv_v;
+        const F i_o1 = o1 * inv_o, i_o2 = o2 * inv_o, i_v1 = v1 * inv_v, i_v2 = v2 * inv_v;
+        const F h11 = e * both - o1 * i_o1 - v1 * i_v1 + k * s11;
+        const F h22 = g * both - o2 * i_o2 - v2 * i_v2 + k * s22;
+        const F h12 = f * both - o1 * i_o2 - v1 * i_v2 + k * s12;
         const F g1 = o1 + v1, g2 = o2 + v2;
         const F det_h = h11 * h22 - h12 * h12;
-        const F q1 = s11 * g1 + s12 * g2 + n_o * o1 * inv_o + n_v * v1 * inv_v;
-        const F q2 = s12 * g1 + s22 * g2 + n_o * o2 * inv_o + n_v * v2 * inv_v;
         const F inv_w = 1.0f / w_n;
-        const F j11 = h11 + g1 * q1 * inv_w, j12 = h12 + g1 * q2 * inv_w;
-        const F j21 = h12 + g2 * q1 * inv_w, j22 = h22 + g2 * q2 * inv_w;
+        const F q1 = (dot(s.n_u, w_t) + n_o * i_o1 + n_v * i_v1) * inv_w;
+        const F q2 = (dot(s.n_v, w_t) + n_o * i_o2 + n_v * i_v2) * inv_w;
+        const F j11 = h11 + g1 * q1, j12 = h12 + g1 * q2, j21 = h12 + g2 * q1, j22 = h22 + g2 * q2;
         const F det_j = j11 * j22 - j12 * j21;
         const I full = (w_n > normal_part_min) & (det_j > spd_share * det_h) & (det_j > 0.0f);
         const F det = pick(full, det_j, det_h);
-        const F inv = pick(det > 0.0f, 1.0f / det, F(0.0f));
+        const F inv = pick(det > det_min, 1.0f / det, F(0.0f));
         const F d1 = (pick(full, j22, h22) * g1 - pick(full, j12, h12) * g2) * inv;
         const F d2 = (pick(full, j11, h11) * g2 - pick(full, j21, h12) * g1) * inv;
-        return add(times(d1, t1), times(d2, t2));
+        return add(times(d1, s.p_u), times(d2, s.p_v));
     };
     auto step_on_cube = [&](V x, V p, V step, F shrink) -> V {
         const V whitened = product(p, inv_extent), move = product(step, inv_extent);
@@ -229,4 +245,5 @@ REFLECTOR_MAP = r"""
             cap = fmin(cap, step_cap * length(whitened) / fmax(length(move), F(1.0e-30f)));
         return project_to_cube(add(times(size(whitened), x), times(cap * shrink, move)));
     };
+    (void)slide; (void)sample;
 """

@@ -4,6 +4,7 @@ Source: Estalella, Martin, Drettakis, Tost, Devillers, Cazals, "Accurate Interac
 Objects" (2005), sections 4.2-4.3 (search) and 6.1 (hidden vertices). What differs:
 - the default search is Newton's method on the tangential bisector over its normal part, with the surface derivatives of
   the same four texels; the paper's midpoint search is `search="midpoint"`;
+- where the residual is so small that Newton's next one will do, the texels just read tell what is at the end of its step;
 - the residual is the angle's tangent, not E = (1 - B.N) / 2, which loses all angles below 3.4e-4 in float32;
 - a vertex behind the reflector is recognised by the body's gauge along the eye's line of sight, which is convex for a
   convex body.
@@ -15,7 +16,7 @@ import warp as wp
 
 from warp_reflect.cubemap import project_to_cube
 from warp_reflect.layers import CameraView, project
-from warp_reflect.reflector_maps import MapSample, ReflectorMapView, least_mask, sample_map
+from warp_reflect.reflector_maps import MapSample, ReflectorMapView, least_mask, map_cell, sample_map, slide
 from warp_reflect.settings import Settings, Status
 from warp_reflect.shapes import max_abs
 from warp_reflect.techniques.vertices import SolveFrame, VertexView, edge_reach, virtual_vertex
@@ -34,10 +35,15 @@ RETRY_SHRINK = wp.constant(0.4)
 SHRINK_MIN = wp.constant(1.0e-3)  # a step shortened to this share lowers nothing any more
 SHRINK_NEAR = wp.constant(0.1)  # likewise where the residual is ACCEPTED: what is left is the map's own roughness
 NORMAL_PART_MIN = wp.constant(1.0e-3)  # of |o + v|; below it the residual's tangent is not trusted
+CONVEX_SHARE = wp.constant(0.98)  # of the square that bounds a convex body's mixed curvature: up to here nothing is cut
+DET_MIN = wp.constant(1.0e-30)  # of the Hessian in texels; below it there is no step
 SPD_SHARE = wp.constant(0.05)  # det J below this share of det H: take the safe step
 # Length of o + v where the path over a point is as good as straight. The root's path is no longer: on a convex body it grazes
 # as well, and what a picture shows of it is as good as the real point, with or without a second start.
 STRAIGHT = wp.constant(0.1)
+TWIST_MAX = wp.constant(
+    0.01
+)  # of a cell's twist (h^2 or so): what the end of a last step may be off, 2e-6 at 128 nodes
 COARSE_NODES = wp.constant(7)  # per face edge of the fallback seed
 GAUGE_STEPS = wp.constant(10)  # of the bracket that finds the least gauge along a line of sight
 GAUGE_INSIDE = wp.constant(1.0e-4)  # gauge margin inside which a point counts as on the surface
@@ -120,7 +126,7 @@ def measure(s: MapSample, x: wp.vec3, eye: wp.vec3, target: wp.vec3) -> SearchRe
     r.n = s.n
     to_eye = eye - s.p
     to_target = target - s.p
-    # The reciprocals are those of `newton_step`, which the compiler shares.
+    # The reciprocals, here and below, are those of `newton_step`, which the compiler shares.
     o = to_eye * (1.0 / wp.max(wp.length(to_eye), 1.0e-20))
     v = to_target * (1.0 / wp.max(wp.length(to_target), 1.0e-20))
     w = o + v
@@ -129,7 +135,7 @@ def measure(s: MapSample, x: wp.vec3, eye: wp.vec3, target: wp.vec3) -> SearchRe
     w_n = r.cos_eye + r.cos_target
     w_t = wp.length(w - w_n * s.n)
     if w_n > NORMAL_PART_MIN:
-        r.residual = w_t / w_n
+        r.residual = w_t * (1.0 / w_n)
     else:
         r.residual = 1.0e4 - w_n
     return r
@@ -137,56 +143,48 @@ def measure(s: MapSample, x: wp.vec3, eye: wp.vec3, target: wp.vec3) -> SearchRe
 
 @wp.func
 def newton_step(s: MapSample, eye: wp.vec3, target: wp.vec3) -> wp.vec3:
-    """Tangential displacement towards the zero of w_T / w_N (w = o + v unnormalised).
+    """Displacement on the texels' patch towards the zero of w_T / w_N (w = o + v unnormalised).
 
-    H = T^T [(I - o o^T)/d_O + (I - v v^T)/d_V] T + w_N S is the Hessian of the path length, S the shape operator from the
-    map's own derivatives, clamped to a convex body's; the residual's Jacobian adds the rank-one change of w_N.
+    H = T^T [(I - o o^T)/d_O + (I - v v^T)/d_V] T + w_N II is the Hessian of the path length in the map's own coordinates: T
+    holds the tangential parts of p_u and p_v, and the second fundamental form II, clamped to a convex body's, comes from the
+    derivatives of the same texels. The residual's Jacobian adds the rank-one change of w_N.
     """
     to_eye = eye - s.p
     to_target = target - s.p
-    d_o = wp.length(to_eye)
-    d_v = wp.length(to_target)
-    inv_o = 1.0 / wp.max(d_o, 1.0e-20)
-    inv_v = 1.0 / wp.max(d_v, 1.0e-20)
+    inv_o = 1.0 / wp.max(wp.length(to_eye), 1.0e-20)
+    inv_v = 1.0 / wp.max(wp.length(to_target), 1.0e-20)
     o = to_eye * inv_o
     v = to_target * inv_v
     n = s.n
-    # Orthonormal basis without branches: Duff et al. 2017, "Building an Orthonormal Basis, Revisited".
-    sign = wp.where(n[2] < 0.0, -1.0, 1.0)
-    f = -1.0 / (sign + n[2])
-    g0 = n[0] * n[1] * f
-    t1 = wp.vec3(1.0 + sign * n[0] * n[0] * f, sign * g0, -sign * n[0])
-    t2 = wp.vec3(g0, sign + n[1] * n[1] * f, -n[1])
-    o1 = wp.dot(t1, o)
-    o2 = wp.dot(t2, o)
-    v1 = wp.dot(t1, v)
-    v2 = wp.dot(t2, v)
     n_o = wp.dot(n, o)
     n_v = wp.dot(n, v)
     w_n = n_o + n_v
-    # Shape operator S = JN JP^-1.
-    a11 = wp.dot(t1, s.p_u)
-    a12 = wp.dot(t1, s.p_v)
-    a21 = wp.dot(t2, s.p_u)
-    a22 = wp.dot(t2, s.p_v)
-    b11 = wp.dot(t1, s.n_u)
-    b12 = wp.dot(t1, s.n_v)
-    b21 = wp.dot(t2, s.n_u)
-    b22 = wp.dot(t2, s.n_v)
-    det_p = a11 * a22 - a12 * a21
-    s11 = float(0.0)
-    s12 = float(0.0)
-    s22 = float(0.0)
-    if wp.abs(det_p) > 1.0e-20:
-        inv_p = 1.0 / det_p
-        s11 = wp.max((b11 * a22 - b12 * a21) * inv_p, 0.0)
-        s22 = wp.max((b22 * a11 - b21 * a12) * inv_p, 0.0)
+    w_t = (o + v) - w_n * n
+    # Tangential parts: of both directions, and of the squares.
+    n_1 = wp.dot(n, s.p_u)
+    n_2 = wp.dot(n, s.p_v)
+    o1 = wp.dot(o, s.p_u) - n_o * n_1
+    o2 = wp.dot(o, s.p_v) - n_o * n_2
+    v1 = wp.dot(v, s.p_u) - n_v * n_1
+    v2 = wp.dot(v, s.p_v) - n_v * n_2
+    e = wp.dot(s.p_u, s.p_u) - n_1 * n_1
+    f = wp.dot(s.p_u, s.p_v) - n_1 * n_2
+    g = wp.dot(s.p_v, s.p_v) - n_2 * n_2
+    s11 = wp.max(wp.dot(s.n_u, s.p_u), 0.0)
+    s22 = wp.max(wp.dot(s.n_v, s.p_v), 0.0)
+    s12 = 0.5 * (wp.dot(s.n_u, s.p_v) + wp.dot(s.n_v, s.p_u))
+    if s12 * s12 > CONVEX_SHARE * (s11 * s22):
         bound = wp.sqrt(s11 * s22)
-        s12 = wp.clamp(0.5 * ((b12 * a11 - b11 * a12) + (b21 * a22 - b22 * a21)) * inv_p, -bound, bound)
+        s12 = wp.clamp(s12, -bound, bound)
     k = wp.max(w_n, 0.0)
-    h11 = (1.0 - o1 * o1) * inv_o + (1.0 - v1 * v1) * inv_v + k * s11
-    h22 = (1.0 - o2 * o2) * inv_o + (1.0 - v2 * v2) * inv_v + k * s22
-    h12 = -o1 * o2 * inv_o - v1 * v2 * inv_v + k * s12
+    both = inv_o + inv_v
+    i_o1 = o1 * inv_o
+    i_o2 = o2 * inv_o
+    i_v1 = v1 * inv_v
+    i_v2 = v2 * inv_v
+    h11 = e * both - o1 * i_o1 - v1 * i_v1 + k * s11
+    h22 = g * both - o2 * i_o2 - v2 * i_v2 + k * s22
+    h12 = f * both - o1 * i_o2 - v1 * i_v2 + k * s12
     g1 = o1 + v1
     g2 = o2 + v2
     det = h11 * h22 - h12 * h12
@@ -195,13 +193,13 @@ def newton_step(s: MapSample, eye: wp.vec3, target: wp.vec3) -> wp.vec3:
     m21 = h12
     m22 = h22
     if w_n > NORMAL_PART_MIN:
-        q1 = s11 * g1 + s12 * g2 + n_o * o1 * inv_o + n_v * v1 * inv_v
-        q2 = s12 * g1 + s22 * g2 + n_o * o2 * inv_o + n_v * v2 * inv_v
         inv_w = 1.0 / w_n
-        j11 = h11 + g1 * q1 * inv_w
-        j12 = h12 + g1 * q2 * inv_w
-        j21 = h12 + g2 * q1 * inv_w
-        j22 = h22 + g2 * q2 * inv_w
+        q1 = (wp.dot(s.n_u, w_t) + n_o * i_o1 + n_v * i_v1) * inv_w
+        q2 = (wp.dot(s.n_v, w_t) + n_o * i_o2 + n_v * i_v2) * inv_w
+        j11 = h11 + g1 * q1
+        j12 = h12 + g1 * q2
+        j21 = h12 + g2 * q1
+        j22 = h22 + g2 * q2
         det_j = j11 * j22 - j12 * j21
         if det_j > SPD_SHARE * det and det_j > 0.0:
             det = det_j
@@ -210,11 +208,11 @@ def newton_step(s: MapSample, eye: wp.vec3, target: wp.vec3) -> wp.vec3:
             m21 = j21
             m22 = j22
     inv = float(0.0)
-    if det > 0.0:
+    if det > DET_MIN:
         inv = 1.0 / det
     d1 = (m22 * g1 - m12 * g2) * inv
     d2 = (m11 * g2 - m21 * g1) * inv
-    return d1 * t1 + d2 * t2
+    return d1 * s.p_u + d2 * s.p_v
 
 
 @wp.func
@@ -286,7 +284,8 @@ def search_newton(
         sample = sample_map(map, x)
         r = measure(sample, x, eye, target)
         used += 1
-        if r.residual < best.residual:
+        better = r.residual < best.residual
+        if better:
             best = r
             step = newton_step(sample, eye, target)
             shrink = 1.0
@@ -310,6 +309,17 @@ def search_newton(
             break
         else:
             x = step_on_cube(map, best, step, shrink)
+            # Newton squares the residual. Where that will do, the last step hardly ever leaves the four texels just read:
+            # they tell what is at its end.
+            if better and best.residual * best.residual <= tolerance and used < 2 * evaluations:
+                cell = map_cell(map, x)
+                along_u = cell.a - sample.cell.a
+                along_v = cell.b - sample.cell.b
+                if cell.texel == sample.cell.texel and wp.abs(along_u * along_v) <= TWIST_MAX:
+                    end = measure(slide(sample, along_u, along_v), x, eye, target)
+                    if end.residual <= tolerance:
+                        best = end
+                        break
     best.evaluations = used
     return best
 

@@ -2,7 +2,8 @@
 
 The same steps with the same decisions in every lane. Visible vertices of the block are moved together first, and again
 where few of a vector's lanes go on and where searches that did not end near a root start from a coarse seed. The vectors of
-a block take each evaluation in turn: every operation of a search waits for the one before it, those of its neighbours don't.
+a block take turns at each part of an evaluation: every operation of a search waits for the one before it, those of its
+neighbours don't.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ from warp_reflect.techniques.map_search import (
     ACCEPTED,
     COARSE_NODES,
     CONVERGED,
+    CONVEX_SHARE,
+    DET_MIN,
     GAUGE_INSIDE,
     GAUGE_STEPS,
     GRAZING_COS,
@@ -29,6 +32,7 @@ from warp_reflect.techniques.map_search import (
     SPD_SHARE,
     STEP_CAP,
     STRAIGHT,
+    TWIST_MAX,
     UNREFLECTED,
     SearchSettings,
 )
@@ -49,13 +53,13 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
     const F eye_height = fmax(length(white_eye) - 1.0f, F(1.0e-3f));
     // What is left to search, side by side, and a vector more for the last load: of a block, then of all blocks.
     constexpr int FEW = 3, TASK = BLOCKS * BLOCK, FEW_ROW = FEW * TASK / LANES + LANES;
-    enum { X = 3, STEP = 6, RESIDUAL = 9, SHRINK = 10, KEPT = 11 };
+    enum { X = 3, BEST = 6, P = 9, N = 12, STEP = 15, RESIDUAL = 18, SHRINK = 19, KEPT = 20 };
     float at[X + 3][BLOCK + LANES], few[KEPT][FEW_ROW], far[X + 3][TASK + LANES];
     int vertex_of[BLOCK + LANES], few_vertex[FEW_ROW], few_used[FEW_ROW], far_vertex[TASK + LANES];
     int few_count = 0, far_count = 0;
 // Between what is read and what is written of a row: the compiler would make masked stores of them, which are slow.
 #define KEEP_APART(row) asm volatile("" : : "r"(&row) : "memory");
-    struct Search { V target, x, best, p, n, step; F residual, shrink; I asked, going, better, later, used; Sample s; };
+    struct Search { V target, x, best, p, n, step; F residual, shrink; I asked, going, near, later, used; Cell cell; Sample s; };
     constexpr int ROWS = BLOCK / LANES;
     Search group[ROWS];
     // map_search.search_newton. A vector goes on while more than FEW of its lanes do: the others go on side by side after the
@@ -190,7 +194,7 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
             numbers[l] = numbers[searched - 1];
             if (in_few) few_used[l] = few_used[searched - 1];
         }
-        // BLOCK of them at a time, evaluation by evaluation: what one vector waits for, its neighbours do.
+        // BLOCK of them at a time, in turns: what one vector waits for, its neighbours do.
         for (int from = 0; from < searched; from += BLOCK) {
             const int vectors = searched - from < BLOCK ? (searched - from + LANES - 1) / LANES : ROWS;
             int open[ROWS], opened = vectors;
@@ -198,67 +202,88 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
                 Search& g = group[k];
                 const int start = from + k * LANES;
                 const float* row = rows + start;
+                auto at_row = [&](int k) -> V {
+                    return V{load(row + k * ROW), load(row + (k + 1) * ROW), load(row + (k + 2) * ROW)};
+                };
                 g.asked = g.going = start + lanes() < searched;
-                g.target = V{load(row), load(row + ROW), load(row + 2 * ROW)};
-                g.x = V{load(row + X * ROW), load(row + (X + 1) * ROW), load(row + (X + 2) * ROW)};
+                g.target = at_row(0);
+                g.x = at_row(X);
                 g.residual = F(1.0e30f);
                 g.shrink = F(1.0f);
                 g.later = g.used = I(0);
                 if (in_few) {
-                    g.best = g.x;
-                    g.step = V{load(row + STEP * ROW), load(row + (STEP + 1) * ROW), load(row + (STEP + 2) * ROW)};
+                    g.best = at_row(BEST);
+                    g.p = at_row(P);
+                    g.n = at_row(N);
+                    g.step = at_row(STEP);
                     g.residual = load(row + RESIDUAL * ROW);
                     g.shrink = load(row + SHRINK * ROW);
                     g.used = iload(few_used + start);
                 }
+                g.cell = map_cell(g.x);
                 open[k] = k;
             }
-            for (bool resumed = in_few; opened > 0; resumed = false) {
-                int on = 0;
+            while (opened > 0) {
+                // Of all vectors the samples, then the steps, then, of those near a root, the ends of the steps.
+                int on = 0, near_root[ROWS], near_count = 0;
+                for (int k = 0; k < opened; ++k) group[open[k]].s = sample_cell(group[open[k]].cell);
                 for (int k = 0; k < opened; ++k) {
                     Search& g = group[open[k]];
-                    const Sample s = sample(g.x);
-                    g.s = s;
-                    if (resumed) {
-                        // Where the search stood: it was the best so far, and its step is known where that was shortened.
-                        g.better = g.going & (g.shrink == 1.0f);
-                        g.p = s.p;
-                        g.n = s.n;
-                        on = opened;
-                        continue;
-                    }
-                    const F here = measure(s, g.target).residual;
+                    const V target = g.target;
+                    const F here = measure(g.s, target).residual;
                     const I better = g.going & (here < g.residual);
-                    const F residual = pick(better, here, g.residual);
-                    const F shrink = pick(better, F(1.0f), g.shrink * retry_shrink);
+                    const V best = vpick(better, g.x, g.best), p = vpick(better, g.s.p, g.p), n = vpick(better, g.s.n, g.n);
+                    V x = g.x, step = g.step;
+                    const F residual = pick(better, here, g.residual), shrink = pick(better, F(1.0f), g.shrink * retry_shrink);
                     const I used = g.used + 1;
-                    const V best = vpick(better, g.x, g.best), p = vpick(better, s.p, g.p), n = vpick(better, s.n, g.n);
+                    const F least = pick(residual <= accepted, F(shrink_near), F(shrink_min));
+                    const I unended = ~(residual <= settings.tolerance) & (shrink >= least);
+                    const I going = g.going & unended & (used < settings.iterations);
+                    if (bits(going)) {
+                        step = vpick(better, newton_step(g.s, target), step);
+                        x = vpick(going, step_on_cube(best, p, step, shrink), x);
+                        g.cell = map_cell(x);
+                    }
+                    const I near = going & better & (residual * residual <= settings.tolerance);
+                    KEEP_APART(g)
+                    g.x = x;
+                    g.best = best;
+                    g.p = p;
+                    g.n = n;
+                    g.step = step;
+                    g.residual = residual;
+                    g.shrink = shrink;
+                    g.used = used;
+                    g.going = going;
+                    g.near = near;
+                    near_root[near_count] = open[k];
+                    near_count += bits(near) != 0;
+                }
+                for (int k = 0; k < near_count; ++k) {
+                    Search& g = group[near_root[k]];
+                    const Cell cell = g.cell;
+                    const F along_u = cell.a - g.s.cell.a, along_v = cell.b - g.s.cell.b;
+                    const Sample end = slide(g.s, along_u, along_v);
+                    const F there = measure(end, g.target).residual;
+                    const I ended = g.near & (cell.texel == g.s.cell.texel) & (magnitude(along_u * along_v) <= twist_max)
+                        & (there <= settings.tolerance);
+                    const V best = vpick(ended, g.x, g.best), p = vpick(ended, end.p, g.p), n = vpick(ended, end.n, g.n);
+                    const F residual = pick(ended, there, g.residual);
                     KEEP_APART(g)
                     g.best = best;
                     g.p = p;
                     g.n = n;
                     g.residual = residual;
-                    g.shrink = shrink;
-                    g.used = used;
-                    g.better = better;
-                    const F least = pick(residual <= accepted, F(shrink_near), F(shrink_min));
-                    const I open_still = ~(residual <= settings.tolerance) & (shrink >= least);
-                    const I going = g.going & open_still & (used < settings.iterations);
-                    const int left = __builtin_popcount(bits(going)), few_left = round < BLOCKS ? FEW : 0;
-                    g.going = going;
-                    g.later = left <= few_left ? going : I(0);
+                    g.going &= ~ended;
+                }
+                for (int k = 0; k < opened; ++k) {
+                    Search& g = group[open[k]];
+                    const int left = __builtin_popcount(bits(g.going)), few_left = round < BLOCKS ? FEW : 0;
+                    g.later = left <= few_left ? g.going : I(0);
                     open[on] = open[k];
                     on += left > few_left;
                 }
                 opened = on;
-                for (int k = 0; k < opened; ++k) {
-                    Search& g = group[open[k]];
-                    const V step = vpick(g.better, newton_step(g.s, g.target), g.step);
-                    const V x = vpick(g.going, step_on_cube(g.best, g.p, step, g.shrink), g.x);
-                    KEEP_APART(g)
-                    g.step = step;
-                    g.x = x;
-                }
             }
             for (int k = 0; k < vectors; ++k) {
                 const Search& g = group[k];
@@ -267,8 +292,8 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
                 const F residual = g.residual;
                 const I asked = g.asked, later = g.later, vertex = iload(numbers + start);
                 if (bits(later)) {
-                    const F each[KEPT] = {target.x, target.y, target.z, best.x, best.y, best.z, g.step.x, g.step.y, g.step.z,
-                        residual, g.shrink};
+                    const F each[KEPT] = {target.x, target.y, target.z, g.x.x, g.x.y, g.x.z, best.x, best.y, best.z,
+                        p.x, p.y, p.z, n.x, n.y, n.z, g.step.x, g.step.y, g.step.z, residual, g.shrink};
                     float lane[KEPT][LANES];
                     int count_of[LANES];
                     for (int k = 0; k < KEPT; ++k) store(lane[k], each[k]);
@@ -340,12 +365,15 @@ def search_block(
     gauge_steps: int,
     gauge_inside: float,
     normal_part_min: float,
+    convex_share: float,
+    det_min: float,
     spd_share: float,
     step_cap: float,
     retry_shrink: float,
     shrink_min: float,
     shrink_near: float,
     straight: float,
+    twist_max: float,
     accepted: float,
     estimate: float,
     grazing_cos: float,
@@ -387,12 +415,15 @@ def search_blocks_kernel(
         GAUGE_STEPS,
         GAUGE_INSIDE,
         NORMAL_PART_MIN,
+        CONVEX_SHARE,
+        DET_MIN,
         SPD_SHARE,
         STEP_CAP,
         RETRY_SHRINK,
         SHRINK_MIN,
         SHRINK_NEAR,
         STRAIGHT,
+        TWIST_MAX,
         ACCEPTED,
         ESTIMATE,
         GRAZING_COS,
