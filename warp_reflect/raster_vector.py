@@ -60,45 +60,45 @@ _TARGET = r"""
     I places;
     EACH_LANE places[l] = place(l);
 #if defined(__AVX512F__)
-#define EVEN 0, 2, 16, 18, 4, 6, 20, 22, 8, 10, 24, 26, 12, 14, 28, 30
-#define ODD 1, 3, 17, 19, 5, 7, 21, 23, 9, 11, 25, 27, 13, 15, 29, 31
 #define FRONT 0, 16, 1, 17, 4, 20, 5, 21, 8, 24, 9, 25, 12, 28, 13, 29
 #define BACK 2, 18, 3, 19, 6, 22, 7, 23, 10, 26, 11, 27, 14, 30, 15, 31
 #else
-#define EVEN 0, 2, 8, 10, 4, 6, 12, 14
-#define ODD 1, 3, 9, 11, 5, 7, 13, 15
 #define FRONT 0, 8, 1, 9, 4, 12, 5, 13
 #define BACK 2, 10, 3, 11, 6, 14, 7, 15
 #endif
+    typedef long long Keys __attribute__((ext_vector_type(LANES / 2)));
+    constexpr unsigned ALL = (1u << LANES) - 1;
+    // The larger keys, which order like whole numbers with a sign, of those at `at` and of halves that are 0 where there is none.
+    auto put = [&](unsigned long long* at, I low, I high) {
+        const Keys drawn[2] = {__builtin_bit_cast(Keys, __builtin_shufflevector(low, high, FRONT)),
+            __builtin_bit_cast(Keys, __builtin_shufflevector(low, high, BACK))};
+        Keys now[2];
+        __builtin_memcpy(now, at, sizeof(now));
+        const decltype(now[0] > now[0]) newer[2] = {drawn[0] > now[0], drawn[1] > now[1]};
+        if (!marks(__builtin_bit_cast(I, newer[0] | newer[1]))) return;
+        now[0] = newer[0] ? drawn[0] : now[0];
+        now[1] = newer[1] ? drawn[1] : now[1];
+        __builtin_memcpy(at, now, sizeof(now));
+    };
     // `count` rows from row y of the target on, at the LANES columns from x on: edge functions with their biases, their steps
-    // from row to row, and depth of the row that many below the first from them. Gives a bit for each covered pixel.
-    auto draw_rows = [&](int x, int y, int count, I ea, I eb, I ec, I row_a, I row_b, I row_c, U low, auto depth_of)
+    // from row to row, and depth of the row that many below the first from them. Gives a bit for each covered pixel. Masks are
+    // signs of numbers: as truth values they would be turned to and fro.
+    auto draw_rows = [&](int x, int y, int count, I ea, I eb, I ec, I row_a, I row_b, I row_c, I low, auto depth_of)
         __attribute__((always_inline)) -> unsigned long long {
         unsigned long long* at = keys + y * width + x;
         unsigned long long covered = 0;
         for (int row = 0; row < count; ++row, at += width, ea += row_a, eb += row_b, ec += row_c) {
-            I inside = (ea | eb | ec) >= 0;
-            if (!marks(inside)) continue;
-            const F depth = depth_of(row, ea, eb, ec, inside);
-            inside &= depth > key_min;
+            const I outside = ea | eb | ec;
+            if (marks(outside) == ALL) continue;
+            const F depth = depth_of(row, ea, eb, ec, outside);
+            I inside = __builtin_bit_cast(I, key_min - depth) & ~outside;
             if (masked) {
                 const int* mask = target.mask.data + (target.y0 + y + row) * target.mask_width + target.x0 + x;
                 inside &= igather(mask, places) == target.mask_value;
             }
             covered |= (unsigned long long)marks(inside) << LANES * row;
-            U a, b;
-            __builtin_memcpy(&a, at, sizeof(a));
-            __builtin_memcpy(&b, at + LANES / 2, sizeof(b));
-            U low_now = __builtin_shufflevector(a, b, EVEN), high_now = __builtin_shufflevector(a, b, ODD);
-            const F now = __builtin_bit_cast(F, high_now);
-            inside &= (depth > now) | ((depth == now) & (low > low_now));
-            if (!marks(inside)) continue;
-            low_now = inside ? low : low_now;
-            high_now = inside ? __builtin_bit_cast(U, depth) : high_now;
-            a = __builtin_shufflevector(low_now, high_now, FRONT);
-            b = __builtin_shufflevector(low_now, high_now, BACK);
-            __builtin_memcpy(at, &a, sizeof(a));
-            __builtin_memcpy(at + LANES / 2, &b, sizeof(b));
+            inside >>= 31;
+            put(at, low & inside, __builtin_bit_cast(I, depth) & inside);
         }
         return covered;
     };
@@ -237,7 +237,7 @@ _TARGET = r"""
             const I across_a = bias_a - places * step_a, across_b = bias_b - places * step_b;
             const I across_c = bias_c - places * step_c;
             const F key_a = F(keys_a[l]), key_b = F(keys_b[l]), key_c = F(keys_c[l]), inv = F(inverse[l]);
-            auto depth_of = [&](int row, I ea, I eb, I ec, I inside) __attribute__((always_inline)) -> F {
+            auto depth_of = [&](int row, I ea, I eb, I ec, I outside) __attribute__((always_inline)) -> F {
                 return (__builtin_convertvector(ea - bias_a, F) * key_a + __builtin_convertvector(eb - bias_b, F) * key_b
                     + __builtin_convertvector(ec - bias_c, F) * key_c) * inv;
             };
@@ -250,7 +250,7 @@ _TARGET = r"""
                 const int c = field[EC][l] + (y - y_first) * row_c - (x - x_first) * step_c;
                 if (((a + field[OVER_A][l]) | (b + field[OVER_B][l]) | (c + field[OVER_C][l])) < 0) return 0;
                 return draw_rows(x, y, count, a + across_a, b + across_b, c + across_c, I(row_a), I(row_b), I(row_c),
-                    U((unsigned)field[LOW][l]), depth_of);
+                    I(field[LOW][l]), depth_of);
             };
             if (y_last - y_first < TILE_ROWS && x_last - x_first < LANES) {
                 // So small that it is drawn sooner than looked for behind others.
@@ -366,18 +366,18 @@ def draw_block(
                 + magnitude(ea, eb, ec) + rise;
             if (above((float)(nearest < most_key ? nearest : most_key)) < tile.known) continue;
             F found = F(__builtin_inff());
-            auto depth_of = [&](int row, I, I, I, I inside) __attribute__((always_inline)) -> F {
+            auto depth_of = [&](int row, I, I, I, I outside) __attribute__((always_inline)) -> F {
                 const double down = 256.0 * row;
                 const F a = __builtin_convertvector((double)ea + down * dxa - wide_a, F);
                 const F b = __builtin_convertvector((double)eb + down * dxb - wide_b, F);
                 const F c = __builtin_convertvector((double)ec + down * dxc - wide_c, F);
                 const F depth = (a * ka + b * kb + c * kc) * inv_area;
-                found = pick(inside & (depth < found), depth, found);
+                found = fmin(found, pick(outside < 0, F(__builtin_inff()), depth));
                 return depth;
             };
             const unsigned long long covered = draw_rows(x_begin, y, count, coarse(ea + bias_a) - across_a,
                 coarse(eb + bias_b) - across_b, coarse(ec + bias_c) - across_c, I(dxa), I(dxb), I(dxc),
-                U((unsigned)low), depth_of);
+                I(low), depth_of);
             float least = found[0];
             EACH_LANE least = found[l] < least ? found[l] : least;
             cover(tile, y_tile, covered << LANES * (y - y_tile), least);
