@@ -36,17 +36,9 @@ wp.set_module_options({"enable_backward": False})
 BLOCK = wp.constant(vector.BLOCK)
 
 # What both snippets begin with.
-_TARGET = r"""
-    auto snap = [](F x) -> I { return __builtin_convertvector(__builtin_elementwise_floor(x * 256.0f + 0.5f), I); };
+_TARGET = vector.TRIANGLES + r"""
     // raster.edge_bias
     auto edge_bias = [](I dx, I dy) -> I { return ((dy < 0) | ((dy == 0) & (dx > 0))) ? I(0) : I(-1); };
-    auto marks = [&](I mask) -> unsigned {
-#if defined(__AVX__) && !defined(__AVX512F__)
-        return __builtin_ia32_movmskps256(__builtin_bit_cast(F, mask));
-#else
-        return bits(mask);
-#endif
-    };
     const int width = target.x1 - target.x0;
     const float* ray_of = (const float*)target.ray.data;
     unsigned long long* keys = (unsigned long long*)target.key.data;
@@ -93,65 +85,9 @@ _TARGET = r"""
         + r"""
     constexpr int LISTED = 256;  // fragments that are worked on together
     constexpr int SIDE = 65;  // the most pixels that a box of 64 pixels has side by side
-    auto least = [](I p, I q) -> I { return p < q ? p : q; };
-    auto most = [](I p, I q) -> I { return p > q ? p : q; };
     auto whole = [](F x) -> I { return __builtin_convertvector(x, I); };
     auto apart = [](V a, F s) -> V { return V{a.x / s, a.y / s, a.z / s}; };
-    // The first three of four floats at p[start[l]].
-    auto threes = [](const float* p, I start) -> V {
-        typedef float Four __attribute__((ext_vector_type(4)));
-        V v;
-        _Pragma("clang loop unroll(full)") for (int part = 0; part < LANES; part += 8) {
-            Four r[8];
-            Row s[4];
-            _Pragma("clang loop unroll(full)") for (int l = 0; l < 8; ++l)
-                __builtin_memcpy(&r[l], p + start[part + l], sizeof(Four));
-            _Pragma("clang loop unroll(full)") for (int l = 0; l < 4; ++l)
-                s[l] = __builtin_shufflevector(r[l], r[l + 4], 0, 1, 2, 3, 4, 5, 6, 7);
-            const Row xy = __builtin_shufflevector(s[0], s[1], 0, 1, 8, 9, 4, 5, 12, 13);
-            const Row XY = __builtin_shufflevector(s[2], s[3], 0, 1, 8, 9, 4, 5, 12, 13);
-            const Row zw = __builtin_shufflevector(s[0], s[1], 2, 3, 10, 11, 6, 7, 14, 15);
-            const Row ZW = __builtin_shufflevector(s[2], s[3], 2, 3, 10, 11, 6, 7, 14, 15);
-            const Row x = __builtin_shufflevector(xy, XY, 0, 2, 8, 10, 4, 6, 12, 14);
-            const Row y = __builtin_shufflevector(xy, XY, 1, 3, 9, 11, 5, 7, 13, 15);
-            const Row z = __builtin_shufflevector(zw, ZW, 0, 2, 8, 10, 4, 6, 12, 14);
-            __builtin_memcpy((float*)&v.x + part, &x, sizeof(Row));
-            __builtin_memcpy((float*)&v.y + part, &y, sizeof(Row));
-            __builtin_memcpy((float*)&v.z + part, &z, sizeof(Row));
-        }
-        return v;
-    };
-    // Puts the words of the lanes that are marked one after the other; up to LANES words at `to` are written.
-    auto packed = [](int* to, I words, unsigned marked) -> int {
-#if defined(__AVX2__)
-        struct Order { unsigned long long of[256]; };
-        static constexpr Order order = []() constexpr {
-            Order made{};
-            for (int mask = 0; mask < 256; ++mask)
-                for (int l = 0, n = 0; l < 8; ++l)
-                    if (mask >> l & 1) made.of[mask] |= (unsigned long long)l << 8 * n++;
-            return made;
-        }();
-        typedef int Eight __attribute__((ext_vector_type(8)));
-        typedef unsigned char Bytes __attribute__((ext_vector_type(8)));
-        int count = 0;
-        _Pragma("clang loop unroll(full)") for (int part = 0; part < LANES; part += 8) {
-            const unsigned own = marked >> part & 255;
-            Eight eight;
-            __builtin_memcpy(&eight, (const int*)&words + part, sizeof(eight));
-            eight = __builtin_ia32_permvarsi256(eight,
-                __builtin_convertvector(__builtin_bit_cast(Bytes, order.of[own]), Eight));
-            __builtin_memcpy(to + count, &eight, sizeof(eight));
-            count += __builtin_popcount(own);
-        }
-        return count;
-#else
-        int count = 0;
-        EACH_LANE { to[count] = words[l]; count += marked >> l & 1; }
-        return count;
-#endif
-    };
-    const float* corner_of = (const float*)triangles.data;
+    const int* corner_of = (const int*)triangles.data;
     const int* plane_corner_of = (const int*)plane_triangles.data;
     const float* point_of = (const float*)points.data;
     const float* screen_of = (const float*)screen.data;
@@ -199,59 +135,40 @@ _TARGET = r"""
     unsigned long long others = 0;
     int survivors = 0;
     for (int start = begin; start < end; start += LANES) {
-        const bool full = start + LANES <= end;
-        const I valid = full ? I(-1) : start + lanes() < end;
-        const I t = ipick(valid, start + lanes(), I(start));
-        const V corners_as_floats = vrows(corner_of, start, full, t);
-        const I corner[3] = {__builtin_bit_cast(I, corners_as_floats.x), __builtin_bit_cast(I, corners_as_floats.y),
-            __builtin_bit_cast(I, corners_as_floats.z)};
-        V v[3];
-        _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each) v[each] = threes(screen_of, 4 * corner[each]);
-        F k[3] = {v[0].z, v[1].z, v[2].z};
-        // Dropped vertices, and those that are not a number.
-        const I kept = valid & (k[0] >= 0.0f) & (k[1] >= 0.0f) & (k[2] >= 0.0f);
-        if (!bits(kept)) continue;
-        I clipped = I(0);
-        _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each)
-            clipped |= (k[each] == 0.0f) | (__builtin_elementwise_abs(v[each].x) > guard)
-                | (__builtin_elementwise_abs(v[each].y) > guard);
-        clipped &= kept;
+        const int count = end - start < LANES ? end - start : LANES;
+        const int* corners = corner_of + 3 * start;
+        int rest[3 * LANES];
+        if (count < LANES) {
+            for (int k = 0; k < 3 * LANES; ++k) rest[k] = corners[k < 3 * count ? k : k % 3];
+            corners = rest;
+        }
+        const Corners c = cornered(corners, 3, screen_of, guard, target.x0, target.y0, target.x1, target.y1);
+        const unsigned valid = (1u << count) - 1;
+        const I top = most(c.top, I(row0)), bottom = least(c.bottom, I(row1 - 1));
+        const I surviving = c.sound & (c.left <= c.right) & (c.top <= c.bottom);
+        const unsigned seen = marks(surviving & (top <= bottom)) & valid, small = marks(c.small);
+        unsigned cut = marks(c.clipped) & valid;
+        survivors += __builtin_popcount(marks(surviving) & valid);
+        for (unsigned left_over = cut; left_over != 0; left_over &= left_over - 1) {
+            const int l = __builtin_ctz(left_over);
+            bool before = true;
+            for (int each = 0; each < 3; ++each) before &= screen_of[4 * corners[3 * l + each] + 3] < target.near;
+            if (before) cut &= ~(1u << l);
+        }
+        survivors += __builtin_popcount(cut);
+        others |= (unsigned long long)(cut | (seen & ~small)) << (start - begin);
+        if (!(seen & small)) continue;
+        I drawn = marked(seen & small);
+        F k[3] = {c.v[0].z, c.v[1].z, c.v[2].z};
         if (target.painter != 0) {
             const F middle = (k[0] + k[1] + k[2]) / 3.0f;
             _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each)
                 k[each] = pick(k[each] > 0.0f, middle, k[each]);
         }
-        // What is no finite number snaps to no pixel.
-        const I finite = (v[0].x + v[1].x + v[2].x + v[0].y + v[1].y + v[2].y + k[0] + k[1] + k[2]) * 0.0f == 0.0f;
-        const I sound = kept & finite & ~clipped;
-        I sx[3], sy[3];
-        _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each) {
-            sx[each] = snap(pick(sound, v[each].x, F(0.0f)));
-            sy[each] = snap(pick(sound, v[each].y, F(0.0f)));
-        }
-        const I low_x = least(sx[0], least(sx[1], sx[2])), high_x = most(sx[0], most(sx[1], sx[2]));
-        const I low_y = least(sy[0], least(sy[1], sy[2])), high_y = most(sy[0], most(sy[1], sy[2]));
-        const I left = most((low_x + 127) >> 8, I(target.x0)), right = least((high_x - 128) >> 8, I(target.x1 - 1));
-        const I upper = most((low_y + 127) >> 8, I(target.y0)), lower = least((high_y - 128) >> 8, I(target.y1 - 1));
-        const I surviving = sound & (left <= right) & (upper <= lower);
-        unsigned cut = bits(clipped);
-        for (unsigned left_over = cut; left_over != 0; left_over &= left_over - 1) {
-            const int l = __builtin_ctz(left_over);
-            bool before = true;
-            for (int each = 0; each < 3; ++each) before &= screen_of[4 * corner[each][l] + 3] < target.near;
-            if (before) cut &= ~(1u << l);
-        }
-        survivors += __builtin_popcount(bits(surviving)) + __builtin_popcount(cut);
-        const I top = most(upper, I(row0)), bottom = least(lower, I(row1 - 1));
-        const I seen = surviving & (top <= bottom);
-        const I small = (high_x - low_x <= 64 * 256) & (high_y - low_y <= 64 * 256);
-        others |= (unsigned long long)(cut | bits(seen & ~small)) << (start - begin);
-        I drawn = seen & small;
-        if (!bits(drawn)) continue;
         // Of what is not drawn here products would not fit.
-        const I xa = ipick(drawn, sx[0], I(0)), ya = ipick(drawn, sy[0], I(0));
-        I xb = ipick(drawn, sx[1], I(0)), yb = ipick(drawn, sy[1], I(0));
-        I xc = ipick(drawn, sx[2], I(0)), yc = ipick(drawn, sy[2], I(0));
+        const I xa = ipick(drawn, c.x[0], I(0)), ya = ipick(drawn, c.y[0], I(0));
+        I xb = ipick(drawn, c.x[1], I(0)), yb = ipick(drawn, c.y[1], I(0));
+        I xc = ipick(drawn, c.x[2], I(0)), yc = ipick(drawn, c.y[2], I(0));
         I area = (xb - xa) * (yc - ya) - (yb - ya) * (xc - xa);
         drawn &= area != 0;
         const I turned = area < 0;
@@ -260,11 +177,11 @@ _TARGET = r"""
         xb = ipick(turned, xc, xb); yb = ipick(turned, yc, yb);
         xc = ipick(turned, x_b, xc); yc = ipick(turned, y_b, yc);
         const I dx[3] = {xc - xb, xa - xc, xb - xa}, dy[3] = {yc - yb, ya - yc, yb - ya};
-        const I px = ipick(drawn, left * 256 + 128, I(0)), py = ipick(drawn, top * 256 + 128, I(0));
+        const I px = ipick(drawn, c.left * 256 + 128, I(0)), py = ipick(drawn, top * 256 + 128, I(0));
         const I e[3] = {dx[0] * (py - yb) - dy[0] * (px - xb), dx[1] * (py - yc) - dy[1] * (px - xc),
             dx[2] * (py - ya) - dy[2] * (px - xa)};
-        const I columns = right - left, rows = ipick(drawn, bottom - top, I(-1));
-        const I cell = (top - target.y0) * width + left - target.x0;
+        const I columns = c.right - c.left, rows = ipick(drawn, bottom - top, I(-1));
+        const I cell = (top - target.y0) * width + c.left - target.x0;
         const int own = start - begin;
         // Columns from `edge / step` on, or up to there. Half of a 1/65536 pixel off, no quotient is 0 by 0.
         F inverse[3];
@@ -295,15 +212,15 @@ _TARGET = r"""
             from = __builtin_elementwise_ceil(from - 1.0e-4f);
             to = __builtin_elementwise_floor(to + 1.0e-4f);
             const I some = (from <= to) & (y <= rows);
-            const unsigned marked = marks(some);
-            owners |= marked;
+            const unsigned here = marks(some);
+            owners |= here;
             // Of lanes without a run any number.
-            run_count += packed(runs + run_count, run + whole(pick(some, from * 255.0f + to, F(0.0f))), marked);
+            run_count += packed(runs + run_count, run + whole(pick(some, from * 255.0f + to, F(0.0f))), here);
         }
         if (owners == 0) continue;
         touched |= (unsigned long long)owners << own;
         istore(cell_of + own, cell);
-        istore(low_of + own, ~(ids.shape[0] > 0 ? igather(ids.data, t) : t + id_offset));
+        istore(low_of + own, ~(ids.shape[0] > 0 ? igather(ids.data, least(start + lanes(), I(end - 1))) : start + lanes() + id_offset));
         float fields[(FIELDS - 4) * LANES];
         auto keep = [&](int field, I value) { istore((int*)fields + LANES * field, value); };
         auto keep_float = [&](int field, F value) { store(fields + LANES * field, value); };
@@ -349,7 +266,11 @@ _TARGET = r"""
         if (bits(last)) {
             _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each) p[each] = vgather(point_of, corner[each]);
         } else {
-            _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each) p[each] = threes(point_of, 3 * corner[each]);
+            _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each) {
+                int at[LANES];
+                istore(at, 3 * corner[each]);
+                p[each] = threes(point_of, at);
+            }
         }
         const V n = cross(sub(p[1], p[0]), sub(p[2], p[0]));
         const F square = dot(n, n);
@@ -405,8 +326,8 @@ def draw_block(
         + r"""
     typedef double D __attribute__((ext_vector_type(LANES)));
     typedef decltype(D() < D()) Wide;
-    auto least = [](int p, int q) -> int { return p < q ? p : q; };
-    auto most = [](int p, int q) -> int { return p > q ? p : q; };
+    auto lesser = [](int p, int q) -> int { return p < q ? p : q; };
+    auto larger = [](int p, int q) -> int { return p > q ? p : q; };
     const int xa = snap(F(a[0]))[0], ya = snap(F(a[1]))[0];
     int xb = snap(F(b[0]))[0], yb = snap(F(b[1]))[0], xc = snap(F(c[0]))[0], yc = snap(F(c[1]))[0];
     float kb = b[2], kc = c[2];
@@ -419,11 +340,11 @@ def draw_block(
         xb = xc; yb = yc; kb = kc;
         xc = x; yc = y; kc = k;
     }
-    const int low_x = least(xa, least(xb, xc)), high_x = most(xa, most(xb, xc));
-    const int low_y = least(ya, least(yb, yc)), high_y = most(ya, most(yb, yc));
-    const int left = most((low_x + 127) >> 8, target.x0), right = least((high_x - 128) >> 8, target.x1 - 1);
-    const int top = most((low_y + 127) >> 8, most(target.y0, row_first));
-    const int bottom = least((high_y - 128) >> 8, least(target.y1, row_end) - 1);
+    const int low_x = lesser(xa, lesser(xb, xc)), high_x = larger(xa, larger(xb, xc));
+    const int low_y = lesser(ya, lesser(yb, yc)), high_y = larger(ya, larger(yb, yc));
+    const int left = larger((low_x + 127) >> 8, target.x0), right = lesser((high_x - 128) >> 8, target.x1 - 1);
+    const int top = larger((low_y + 127) >> 8, larger(target.y0, row_first));
+    const int bottom = lesser((high_y - 128) >> 8, lesser(target.y1, row_end) - 1);
     if (left > right || top > bottom) return;
     const int dxa = xc - xb, dya = yc - yb, dxb = xa - xc, dyb = ya - yc, dxc = xb - xa, dyc = yb - ya;
     const int px = left * 256 + 128, py = top * 256 + 128;

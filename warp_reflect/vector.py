@@ -240,6 +240,111 @@ _HEAD = r"""
     (void)vload; (void)vstore; (void)vstore4; (void)vrows; (void)frow; (void)irow;
 """
 
+# Beside it, for the rasteriser's snippets: rows of triangles.
+TRIANGLES = r"""
+    auto marks = [bits](I mask) -> unsigned {
+#if defined(__AVX__) && !defined(__AVX512F__)
+        return __builtin_ia32_movmskps256(__builtin_bit_cast(F, mask));
+#else
+        return bits(mask);
+#endif
+    };
+    // The mask of marks. Masks that are kept over a branch are turned into truth values of 16 bits and back; numbers are not.
+    auto marked = [lanes](unsigned marks) -> I { return (I(marks) << (31 - lanes())) < 0; };
+    auto least = [](I p, I q) -> I { return p < q ? p : q; };
+    auto most = [](I p, I q) -> I { return p > q ? p : q; };
+    auto snap = [](F x) -> I { return __builtin_convertvector(__builtin_elementwise_floor(x * 256.0f + 0.5f), I); };
+    // The first three of four floats at p[start[l]].
+    auto threes = [](const float* p, const int* start) -> V {
+        typedef float Four __attribute__((ext_vector_type(4)));
+        V v;
+        _Pragma("clang loop unroll(full)") for (int part = 0; part < LANES; part += 8) {
+            Four r[8];
+            Row s[4];
+            _Pragma("clang loop unroll(full)") for (int l = 0; l < 8; ++l)
+                __builtin_memcpy(&r[l], p + start[part + l], sizeof(Four));
+            _Pragma("clang loop unroll(full)") for (int l = 0; l < 4; ++l)
+                s[l] = __builtin_shufflevector(r[l], r[l + 4], 0, 1, 2, 3, 4, 5, 6, 7);
+            const Row xy = __builtin_shufflevector(s[0], s[1], 0, 1, 8, 9, 4, 5, 12, 13);
+            const Row XY = __builtin_shufflevector(s[2], s[3], 0, 1, 8, 9, 4, 5, 12, 13);
+            const Row zw = __builtin_shufflevector(s[0], s[1], 2, 3, 10, 11, 6, 7, 14, 15);
+            const Row ZW = __builtin_shufflevector(s[2], s[3], 2, 3, 10, 11, 6, 7, 14, 15);
+            const Row x = __builtin_shufflevector(xy, XY, 0, 2, 8, 10, 4, 6, 12, 14);
+            const Row y = __builtin_shufflevector(xy, XY, 1, 3, 9, 11, 5, 7, 13, 15);
+            const Row z = __builtin_shufflevector(zw, ZW, 0, 2, 8, 10, 4, 6, 12, 14);
+            __builtin_memcpy((float*)&v.x + part, &x, sizeof(Row));
+            __builtin_memcpy((float*)&v.y + part, &y, sizeof(Row));
+            __builtin_memcpy((float*)&v.z + part, &z, sizeof(Row));
+        }
+        return v;
+    };
+    // Puts the words of the lanes that are marked one after the other; up to LANES words at `to` are written.
+    auto packed = [](int* to, I words, unsigned marked) -> int {
+#if defined(__AVX2__)
+        struct Order { unsigned long long of[256]; };
+        static constexpr Order order = []() constexpr {
+            Order made{};
+            for (int mask = 0; mask < 256; ++mask)
+                for (int l = 0, n = 0; l < 8; ++l)
+                    if (mask >> l & 1) made.of[mask] |= (unsigned long long)l << 8 * n++;
+            return made;
+        }();
+        typedef int Eight __attribute__((ext_vector_type(8)));
+        typedef unsigned char Bytes __attribute__((ext_vector_type(8)));
+        int count = 0;
+        _Pragma("clang loop unroll(full)") for (int part = 0; part < LANES; part += 8) {
+            const unsigned own = marked >> part & 255;
+            Eight eight;
+            __builtin_memcpy(&eight, (const int*)&words + part, sizeof(eight));
+            eight = __builtin_ia32_permvarsi256(eight,
+                __builtin_convertvector(__builtin_bit_cast(Bytes, order.of[own]), Eight));
+            __builtin_memcpy(to + count, &eight, sizeof(eight));
+            count += __builtin_popcount(own);
+        }
+        return count;
+#else
+        int count = 0;
+        EACH_LANE { to[count] = words[l]; count += marked >> l & 1; }
+        return count;
+#endif
+    };
+    // Triangles on the screen: (x, y, key) of their corners, which of them have a picture, which of those are to be clipped, and
+    // of the others snapped corners, 0 where there is none, and the box of pixel centres within a target.
+    struct Corners { V v[3]; I kept, clipped, sound, x[3], y[3], left, right, top, bottom, small; };
+    auto cornered = [&](const int* corners, int stride, const float* screen, float guard, int x0, int y0, int x1, int y1)
+        __attribute__((always_inline)) -> Corners {
+        Corners c;
+        _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each) {
+            int at[LANES];
+            EACH_LANE at[l] = 4 * corners[stride * l + each];
+            c.v[each] = threes(screen, at);
+        }
+        F reach = F(0.0f);
+        _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each)
+            reach = fmax(reach, fmax(__builtin_elementwise_abs(c.v[each].x), __builtin_elementwise_abs(c.v[each].y)));
+        const F farthest = fmin(c.v[0].z, fmin(c.v[1].z, c.v[2].z)), sum = c.v[0].z + c.v[1].z + c.v[2].z;
+        // Dropped vertices, and those that are not a number.
+        c.kept = (farthest >= 0.0f) & (sum >= 0.0f);
+        c.clipped = c.kept & ((farthest == 0.0f) | (reach > guard));
+        // What is no finite number snaps to no pixel.
+        const I finite = (c.v[0].x + c.v[1].x + c.v[2].x + c.v[0].y + c.v[1].y + c.v[2].y + sum) * 0.0f == 0.0f;
+        c.sound = c.kept & finite & ~c.clipped;
+        _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each) {
+            c.x[each] = snap(pick(c.sound, c.v[each].x, F(0.0f)));
+            c.y[each] = snap(pick(c.sound, c.v[each].y, F(0.0f)));
+        }
+        const I low_x = least(c.x[0], least(c.x[1], c.x[2])), high_x = most(c.x[0], most(c.x[1], c.x[2]));
+        const I low_y = least(c.y[0], least(c.y[1], c.y[2])), high_y = most(c.y[0], most(c.y[1], c.y[2]));
+        c.left = most((low_x + 127) >> 8, I(x0));
+        c.right = least((high_x - 128) >> 8, I(x1 - 1));
+        c.top = most((low_y + 127) >> 8, I(y0));
+        c.bottom = least((high_y - 128) >> 8, I(y1 - 1));
+        c.small = (high_x - low_x <= 64 * 256) & (high_y - low_y <= 64 * 256);
+        return c;
+    };
+    (void)marks; (void)marked; (void)packed; (void)cornered;
+"""
+
 
 def snippet(body: str, elsewhere: str = "", wide: bool = False, exact: bool = False) -> str:
     """The text of a native function: `body` after the shared head on a CPU, `elsewhere` for CUDA (never launched there).
