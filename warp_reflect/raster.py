@@ -659,7 +659,12 @@ def rasterise(
     survivor_count = wp.zeros(-(-count // step), dtype=int, device=device)
     nearest = wp.empty(count if hides else 0, dtype=float, device=device)
     inputs = [target.view, screen, triangles, step, survivors, survivor_count, nearest]
-    launch(cull_kernel, count, inputs, device, threads, align=step)
+    if hides:
+        split = vector.BLOCK_SPLIT_MIN
+        runs_of = step // vector.BLOCK
+        launch(raster_vector.cull_blocks_kernel, vector.block_count(count), inputs, device, threads, split, runs_of)
+    else:
+        launch(cull_kernel, count, inputs, device, threads, align=step)
     if stays(device):
         from warp_reflect import raster_pieces  # as above
 

@@ -36,7 +36,9 @@ wp.set_module_options({"enable_backward": False})
 BLOCK = wp.constant(vector.BLOCK)
 
 # What both snippets begin with.
-_TARGET = vector.TRIANGLES + r"""
+_TARGET = (
+    vector.TRIANGLES
+    + r"""
     // raster.edge_bias
     auto edge_bias = [](I dx, I dy) -> I { return ((dy < 0) | ((dy == 0) & (dx > 0))) ? I(0) : I(-1); };
     const int width = target.x1 - target.x0;
@@ -77,6 +79,7 @@ _TARGET = vector.TRIANGLES + r"""
         }
     };
 """
+)
 
 
 @wp.func_native(
@@ -220,7 +223,8 @@ _TARGET = vector.TRIANGLES + r"""
         if (owners == 0) continue;
         touched |= (unsigned long long)owners << own;
         istore(cell_of + own, cell);
-        istore(low_of + own, ~(ids.shape[0] > 0 ? igather(ids.data, least(start + lanes(), I(end - 1))) : start + lanes() + id_offset));
+        const I number = start + lanes();
+        istore(low_of + own, ~(ids.shape[0] > 0 ? igather(ids.data, least(number, I(end - 1))) : number + id_offset));
         float fields[(FIELDS - 4) * LANES];
         auto keep = [&](int field, I value) { istore((int*)fields + LANES * field, value); };
         auto keep_float = [&](int field, F value) { store(fields + LANES * field, value); };

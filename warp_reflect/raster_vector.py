@@ -38,21 +38,15 @@ def tile_words(box: tuple[int, int, int, int]) -> int:
 
 
 # What both snippets begin with.
-_TARGET = r"""
-    auto snap = [](F x) -> I { return __builtin_convertvector(__builtin_elementwise_floor(x * 256.0f + 0.5f), I); };
+_TARGET = (
+    vector.TRIANGLES
+    + r"""
     // raster.edge_bias
     auto edge_bias = [](I dx, I dy) -> I { return ((dy < 0) | ((dy == 0) & (dx > 0))) ? I(0) : I(-1); };
     const int width = target.x1 - target.x0;
     const bool masked = target.mask_value > 0;
     unsigned long long* keys = (unsigned long long*)target.key.data;
     const F key_min = F(target.key_min);
-    auto marks = [&](I mask) -> unsigned {
-#if defined(__AVX__) && !defined(__AVX512F__)
-        return __builtin_ia32_movmskps256(__builtin_bit_cast(F, mask));
-#else
-        return bits(mask);
-#endif
-    };
 
     // Rows of keys are worked on as they lie, LANES side by side: as their halves, without a shuffle across 128 bits, where
     // lane l has the key `place(l)`.
@@ -122,6 +116,75 @@ _TARGET = r"""
     auto above = [](auto key) { return key * 1.000001f + 1.0e-37f; };
     auto below = [](auto key) { return key * 0.999999f - 1.0e-37f; };
 """
+)
+
+
+@wp.func_native(
+    vector.snippet(
+        vector.TRIANGLES
+        + r"""
+    const int* corner_of = (const int*)triangles.data;
+    const float* screen_of = (const float*)screen.data;
+    const int end = begin + BLOCK < triangles.shape[0] ? begin + BLOCK : triangles.shape[0];
+    int survivors[BLOCK + LANES], nearest[BLOCK + LANES];
+    int count = 0;
+    for (int start = begin; start < end; start += LANES) {
+        const int length = end - start < LANES ? end - start : LANES;
+        const int* corners = corner_of + 3 * start;
+        int rest[3 * LANES];
+        if (length < LANES) {
+            for (int k = 0; k < 3 * LANES; ++k) rest[k] = corners[k < 3 * length ? k : k % 3];
+            corners = rest;
+        }
+        const Corners c = cornered(corners, 3, screen_of, guard, target.x0, target.y0, target.x1, target.y1);
+        const unsigned valid = (1u << length) - 1;
+        unsigned cut = marks(c.clipped) & valid;
+        for (unsigned left = cut; left != 0; left &= left - 1) {
+            const int l = __builtin_ctz(left);
+            bool before = true;
+            for (int each = 0; each < 3; ++each) before &= screen_of[4 * corners[3 * l + each] + 3] < target.near;
+            if (before) cut &= ~(1u << l);
+        }
+        const unsigned kept = cut | marks(c.sound & (c.left <= c.right) & (c.top <= c.bottom)) & valid;
+        const F key = fmax(c.v[0].z, fmax(c.v[1].z, c.v[2].z)), farthest = fmin(c.v[0].z, fmin(c.v[1].z, c.v[2].z));
+        packed(nearest + count, __builtin_bit_cast(I, pick(farthest == 0.0f, F(__builtin_inff()), key)), kept);
+        count += packed(survivors + count, start + lanes(), kept);
+    }
+    int* place = out_survivor_count.data + begin / step;
+    const int at = begin / step * step + *place;
+    __builtin_memcpy(out_survivors.data + at, survivors, sizeof(int) * count);
+    __builtin_memcpy(out_nearest.data + at, nearest, sizeof(float) * count);
+    *place += count;
+"""
+    )
+)
+def cull_block(
+    begin: int,
+    target: TargetView,
+    screen: wp.array(dtype=wp.vec4),
+    triangles: wp.array(dtype=wp.vec3i),
+    step: int,
+    guard: float,
+    out_survivors: wp.array(dtype=int),
+    out_survivor_count: wp.array(dtype=int),
+    out_nearest: wp.array(dtype=float),
+): ...
+
+
+@wp.kernel
+def cull_blocks_kernel(
+    first: int,
+    target: TargetView,
+    screen: wp.array(dtype=wp.vec4),
+    triangles: wp.array(dtype=wp.vec3i),
+    step: int,
+    out_survivors: wp.array(dtype=int),
+    out_survivor_count: wp.array(dtype=int),
+    out_nearest: wp.array(dtype=float),
+):
+    """As `raster.cull_kernel`, one thread per block of triangles; runs of `step` triangles begin at multiples of `BLOCK`."""
+    begin = (first + wp.tid()) * BLOCK
+    cull_block(begin, target, screen, triangles, step, GUARD, out_survivors, out_survivor_count, out_nearest)
 
 
 @wp.func_native(
@@ -132,8 +195,6 @@ _TARGET = r"""
     auto over = [](I dx, I dy) -> I {
         return (dx > 0 ? dx * (256 * (TILE_ROWS - 1)) : 0) - (dy < 0 ? dy * (256 * (LANES - 1)) : 0);
     };
-    auto least = [](I p, I q) -> I { return p < q ? p : q; };
-    auto most = [](I p, I q) -> I { return p > q ? p : q; };
     const int* corner_of = (const int*)triangles.data;
     const int* numbers = survivors.data + begin;
     const float* screen_of = (const float*)screen.data;
@@ -142,47 +203,28 @@ _TARGET = r"""
 
     unsigned long long others = 0;
     for (int start = 0; start < count; start += LANES) {
-        const I valid = start + lanes() < count;
-        const I t = igather(numbers, ipick(valid, start + lanes(), I(start)));
-        I corner[3];
-        F x[3], y[3], k[3];
-        _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each) {
-            corner[each] = igather(corner_of, 3 * t + each);
-            EACH_LANE {
-                const float* v = screen_of + 4 * corner[each][l];
-                x[each][l] = v[0]; y[each][l] = v[1]; k[each][l] = v[2];
-            }
+        const int length = count - start < LANES ? count - start : LANES;
+        const unsigned valid = (1u << length) - 1;
+        int corners[3 * LANES], number[LANES];
+        for (int l = 0; l < LANES; ++l) {
+            number[l] = numbers[start + (l < length ? l : 0)];
+            __builtin_memcpy(corners + 3 * l, corner_of + 3 * number[l], 3 * sizeof(int));
         }
+        const Corners c = cornered(corners, 3, screen_of, guard, target.x0, row0, target.x1, row1);
+        F k[3] = {c.v[0].z, c.v[1].z, c.v[2].z};
         if (target.painter != 0) {
             const F middle = (k[0] + k[1] + k[2]) / 3.0f;
             _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each)
                 k[each] = pick(k[each] > 0.0f, middle, k[each]);
         }
-        I clipped = I(0);
-        _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each)
-            clipped |= (k[each] == 0.0f) | (__builtin_elementwise_abs(x[each]) > guard)
-                | (__builtin_elementwise_abs(y[each]) > guard);
-        // What is no finite number snaps to no pixel.
-        const I finite = (x[0] + x[1] + x[2] + y[0] + y[1] + y[2] + k[0] + k[1] + k[2]) * 0.0f == 0.0f;
-        const I sound = valid & finite & ~clipped;
-        I sx[3], sy[3];
-        _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each) {
-            sx[each] = snap(pick(sound, x[each], F(0.0f)));
-            sy[each] = snap(pick(sound, y[each], F(0.0f)));
-        }
-        const I low_x = least(sx[0], least(sx[1], sx[2])), high_x = most(sx[0], most(sx[1], sx[2]));
-        const I low_y = least(sy[0], least(sy[1], sy[2])), high_y = most(sy[0], most(sy[1], sy[2]));
-        const I left = most((low_x + 127) >> 8, I(target.x0)), right = least((high_x - 128) >> 8, I(target.x1 - 1));
-        const I top = most((low_y + 127) >> 8, I(row0)), bottom = least((high_y - 128) >> 8, I(row1 - 1));
-        const I seen = sound & (left <= right) & (top <= bottom);
-        const I small = (high_x - low_x <= 64 * 256) & (high_y - low_y <= 64 * 256);
-        others |= (unsigned long long)bits((valid & clipped) | (seen & ~small)) << start;
-        I drawn = seen & small;
-        if (!bits(drawn)) continue;
+        const unsigned seen = marks(c.sound & (c.left <= c.right) & (c.top <= c.bottom)) & valid, small = marks(c.small);
+        others |= (unsigned long long)(marks(c.clipped) & valid | seen & ~small) << start;
+        if (!(seen & small)) continue;
+        I drawn = marked(seen & small);
         // Of what is not drawn here products would not fit.
-        const I xa = ipick(drawn, sx[0], I(0)), ya = ipick(drawn, sy[0], I(0));
-        I xb = ipick(drawn, sx[1], I(0)), yb = ipick(drawn, sy[1], I(0));
-        I xc = ipick(drawn, sx[2], I(0)), yc = ipick(drawn, sy[2], I(0));
+        const I xa = ipick(drawn, c.x[0], I(0)), ya = ipick(drawn, c.y[0], I(0));
+        I xb = ipick(drawn, c.x[1], I(0)), yb = ipick(drawn, c.y[1], I(0));
+        I xc = ipick(drawn, c.x[2], I(0)), yc = ipick(drawn, c.y[2], I(0));
         I area = (xb - xa) * (yc - ya) - (yb - ya) * (xc - xa);
         drawn &= area != 0;
         const I turned = area < 0;
@@ -192,7 +234,7 @@ _TARGET = r"""
         xc = ipick(turned, x_b, xc); yc = ipick(turned, y_b, yc);
         const F kb = pick(turned, k[2], k[1]), kc = pick(turned, k[1], k[2]);
         const I dxa = xc - xb, dya = yc - yb, dxb = xa - xc, dyb = ya - yc, dxc = xb - xa, dyc = yb - ya;
-        const I px = ipick(drawn, left * 256 + 128, I(0)), py = ipick(drawn, top * 256 + 128, I(0));
+        const I px = ipick(drawn, c.left * 256 + 128, I(0)), py = ipick(drawn, c.top * 256 + 128, I(0));
         const F inv_area = 1.0f / __builtin_convertvector(area, F);
         // Of every triangle: edges at the first pixel, steps, and what is left of it.
         enum { EA, EB, EC, BIAS_A, BIAS_B, BIAS_C, OVER_A, OVER_B, OVER_C,
@@ -214,11 +256,11 @@ _TARGET = r"""
         istore(field[DYA], dya * 256);
         istore(field[DYB], dyb * 256);
         istore(field[DYC], dyc * 256);
-        istore(field[COLUMN], left - target.x0);
-        istore(field[COLUMNS], right - left);
-        istore(field[ROW], top - target.y0);
-        istore(field[ROWS], bottom - top);
-        istore(field[LOW], ~(ids.shape[0] > 0 ? igather(ids.data, t) : t + id_offset));
+        istore(field[COLUMN], c.left - target.x0);
+        istore(field[COLUMNS], c.right - c.left);
+        istore(field[ROW], c.top - target.y0);
+        istore(field[ROWS], c.bottom - c.top);
+        istore(field[LOW], ~(ids.shape[0] > 0 ? igather(ids.data, iload(number)) : iload(number) + id_offset));
         float keys_a[LANES], keys_b[LANES], keys_c[LANES], inverse[LANES];
         store(keys_a, k[0]);
         store(keys_b, kb);
@@ -227,7 +269,7 @@ _TARGET = r"""
         float most_key[LANES], least_key[LANES];
         store(most_key, above(fmax(k[0], fmax(kb, kc))));
         store(least_key, below(fmin(k[0], fmin(kb, kc))));
-        for (unsigned left_over = bits(drawn); left_over != 0; left_over &= left_over - 1) {
+        for (unsigned left_over = marks(drawn); left_over != 0; left_over &= left_over - 1) {
             const int l = __builtin_ctz(left_over);
             const int x_first = field[COLUMN][l], x_last = x_first + field[COLUMNS][l];
             const int y_first = field[ROW][l], y_last = y_first + field[ROWS][l];
@@ -297,8 +339,8 @@ def draw_block(
         _TARGET
         + r"""
     typedef double D __attribute__((ext_vector_type(LANES)));
-    auto least = [](int p, int q) -> int { return p < q ? p : q; };
-    auto most = [](int p, int q) -> int { return p > q ? p : q; };
+    auto lesser = [](int p, int q) -> int { return p < q ? p : q; };
+    auto larger = [](int p, int q) -> int { return p > q ? p : q; };
     const int xa = snap(F(a[0]))[0], ya = snap(F(a[1]))[0];
     int xb = snap(F(b[0]))[0], yb = snap(F(b[1]))[0], xc = snap(F(c[0]))[0], yc = snap(F(c[1]))[0];
     const float ka = a[2];
@@ -312,11 +354,11 @@ def draw_block(
         xb = xc; yb = yc; kb = kc;
         xc = x; yc = y; kc = k;
     }
-    const int low_x = least(xa, least(xb, xc)), high_x = most(xa, most(xb, xc));
-    const int low_y = least(ya, least(yb, yc)), high_y = most(ya, most(yb, yc));
-    const int left = most((low_x + 127) >> 8, target.x0), right = least((high_x - 128) >> 8, target.x1 - 1);
-    const int top = most((low_y + 127) >> 8, most(target.y0, row_first));
-    const int bottom = least((high_y - 128) >> 8, least(target.y1, row_end) - 1);
+    const int low_x = lesser(xa, lesser(xb, xc)), high_x = larger(xa, larger(xb, xc));
+    const int low_y = lesser(ya, lesser(yb, yc)), high_y = larger(ya, larger(yb, yc));
+    const int left = larger((low_x + 127) >> 8, target.x0), right = lesser((high_x - 128) >> 8, target.x1 - 1);
+    const int top = larger((low_y + 127) >> 8, larger(target.y0, row_first));
+    const int bottom = lesser((high_y - 128) >> 8, lesser(target.y1, row_end) - 1);
     if (left > right || top > bottom) return;
     const int dxa = xc - xb, dya = yc - yb, dxb = xa - xc, dyb = ya - yc, dxc = xb - xa, dyc = yb - ya;
     const int px = left * 256 + 128, py = top * 256 + 128;
@@ -378,9 +420,9 @@ def draw_block(
             const unsigned long long covered = draw_rows(x_begin, y, count, coarse(ea + bias_a) - across_a,
                 coarse(eb + bias_b) - across_b, coarse(ec + bias_c) - across_c, I(dxa), I(dxb), I(dxc),
                 I(low), depth_of);
-            float least = found[0];
-            EACH_LANE least = found[l] < least ? found[l] : least;
-            cover(tile, y_tile, covered << LANES * (y - y_tile), least);
+            float nearby = found[0];
+            EACH_LANE nearby = found[l] < nearby ? found[l] : nearby;
+            cover(tile, y_tile, covered << LANES * (y - y_tile), nearby);
         }
     }
 """
