@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import threading
+import time
+from functools import partial
+
 import numpy as np
 import pytest
 import warp as wp
@@ -19,17 +24,18 @@ def count_up_kernel(first: int, step: int, out_times: wp.array(dtype=int), out_r
     out_run[i / step] += 1
 
 
-@pytest.mark.parametrize("split_min", [1, 8, 64, launch.SPLIT_MIN])
+@pytest.mark.parametrize("pieces", [1, 3, launch.MOST_PIECES])
 @pytest.mark.parametrize("parts", [2, 3, 8])
 @pytest.mark.parametrize("count", [1, 63, 401, 14400, 462_657])
-def test_slices_are_all_elements_once_the_large_ones_first(count, parts, split_min):
-    made = launch.slices(count, parts, split_min)
-    ends = np.cumsum([length for _, length in made])
-    assert [first for first, _ in made] == [0, *ends[:-1]] and ends[-1] == count
-    lengths = [length for _, length in made]
-    assert sorted(lengths, reverse=True) == lengths and lengths[-1] > 0
-    assert len(made) == 1 or max(lengths) <= max(count / parts, split_min)
-    assert len(made) <= 6 * parts  # each costs something
+def test_slices_are_all_elements_once_the_large_ones_first(count, parts, pieces):
+    for align in (1, launch.SLICE_ALIGN):
+        made = launch.slices(count, parts, pieces, align)
+        ends = np.cumsum([length for _, length in made])
+        assert [first for first, _ in made] == [0, *ends[:-1]] and ends[-1] == count
+        lengths = [length for _, length in made]
+        assert sorted(lengths, reverse=True) == lengths and lengths[-1] > 0
+        assert max(lengths) < count / parts + align
+        assert len(made) <= (pieces + 1) * parts  # each costs something
 
 
 def test_slices_keep_runs_together():
@@ -48,11 +54,48 @@ def test_a_launch_meets_every_element_once(threads):
     np.testing.assert_array_equal(runs.numpy(), [*[step] * (count // step), count % step])
 
 
-def test_failure_of_any_thread_is_raised():
-    def fail():
-        raise ValueError("this one")
-
+@pytest.mark.parametrize("failing", [0, 1, 2])
+def test_failure_of_any_thread_is_raised_when_all_are_done(failing):
     done = []
-    with pytest.raises(ValueError, match="this one"):
-        launch.run_parallel([lambda: done.append(0), fail])
-    assert done == [0]
+
+    def job(k):
+        if k == failing:
+            raise ValueError(f"number {k}")
+        time.sleep(0.01)
+        done.append(k)
+
+    for _ in range(3):
+        done.clear()
+        with pytest.raises(ValueError, match=f"number {failing}"):
+            launch.run_parallel([partial(job, k) for k in range(3)])
+        assert sorted(done) == [k for k in range(3) if k != failing]
+
+
+def test_launches_of_many_threads_do_not_get_into_each_others_way():
+    results = []
+
+    def launching(seed):
+        for k in range(20):
+            times = wp.zeros(20_000 + 64 * seed + k, dtype=int, device="cpu")
+            runs = wp.zeros(1, dtype=int, device="cpu")
+            launch.launch(count_up_kernel, len(times), [1 << 30, times, runs], "cpu", 3)
+            results.append((times.numpy() == 1).all())
+
+    threads = [threading.Thread(target=launching, args=(seed,)) for seed in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(results) == 80 and all(results)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system forks no processes")
+def test_a_forked_process_has_helpers_of_its_own():
+    launch.run_parallel([int, int])  # this one's have been at work
+    parent = os.getpid()
+    child = os.fork()
+    if child == 0:
+        done = threading.Event()
+        launch.run_parallel([lambda: done.wait(10.0), done.set])  # the second one at the same time
+        os._exit(0 if done.is_set() and launch._Helper.idle.keys() == {parent, os.getpid()} else 1)
+    assert os.waitpid(child, 0)[1] == 0

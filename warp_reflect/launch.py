@@ -11,6 +11,7 @@ bit-equal at any number of threads.
 
 from __future__ import annotations
 
+import math
 import os
 import threading
 from collections import deque
@@ -19,16 +20,17 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from copy import copy
 from functools import cache, partial
-from time import perf_counter
+from time import perf_counter, thread_time
+from typing import ClassVar
 
 import warp as wp
 
 SPLIT_MIN = 4096  # elements below which the hand-off (20-60 us) costs more than the second thread saves
 # Of what is left, each thread takes a slice of so much: more would leave no room for elements that cost more than others.
 TAKEN_SHARE = 1 / 2
-# The smallest slices, since one costs 15 us itself: of what is just split, and of each thread's share.
-LEAST_OF_SPLIT = 1 / 4
-LEAST_OF_SHARE = 1 / 8
+# A thread's share is cut into so many of the smallest slices, by the milliseconds that all of the launch takes: each slice
+# costs some 30 us itself, the last ones are waited for.
+PIECES_A_ROOT_MS, MOST_PIECES = 1.6, 8
 # Environment variable: the most threads of a launch where `threads` is 0, for processes that share a machine. It cuts
 # launches, it plans nothing: a frame's plan is the same in all of them.
 CORES_VARIABLE = "WARP_REFLECT_THREADS"
@@ -49,6 +51,8 @@ FINITE_FLAGS = (
 )
 
 
+# Of launches that were split, by their kernel and (binary) order of magnitude: what an element took last time. [s]
+_measured: dict[tuple[wp.Kernel, int], float] = {}
 _recordings: list[list[tuple[str, int]]] = []
 _as_device: list[bool] = []
 _loaded: dict[tuple, Future] = {}
@@ -75,11 +79,6 @@ def recorded() -> Iterator[list[tuple[str, int]]]:
 def _record(kernel, count: int) -> None:
     for launches in _recordings:
         launches.append((f"{kernel.module.name}.{kernel.key}", count))
-
-
-@cache
-def _pool(thread_count: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(thread_count, thread_name_prefix="warp_reflect")
 
 
 def stays(device) -> bool:
@@ -119,23 +118,20 @@ def shared_by(count: int, device, threads: int = 0, split_min: int = SPLIT_MIN) 
     return 1 if count < split_min else parts
 
 
-def slices(count: int, parts: int, split_min: int = SPLIT_MIN, align: int = 0) -> list[tuple[int, int]]:
+def slices(count: int, parts: int, pieces: int = MOST_PIECES, align: int = SLICE_ALIGN) -> list[tuple[int, int]]:
     """(first element, length) of a launch's slices: ever smaller ones.
 
     Args:
         count: Elements in all.
         parts: Threads.
-        split_min: See `launch`: it tells what an element costs.
-        align: Elements that stay together; 0: as many as share a cache line, if elements are that cheap.
+        pieces: The smallest slices that a thread's share is worth.
+        align: Elements that stay together.
     """
-    cheap = max(int(split_min * LEAST_OF_SPLIT), 1)
-    align = align or min(SLICE_ALIGN, cheap)
-    least = max(int(count * LEAST_OF_SHARE / parts), cheap)
+    least = count / (parts * pieces)
     made, first = [], 0
     while first < count:
-        length = max(int((count - first) * TAKEN_SHARE / parts), least)
-        length = min(-(-length // align) * align, count - first)
-        made.append((first, length))
+        length = math.ceil(max((count - first) * TAKEN_SHARE / parts, least) / align) * align
+        made.append((first, min(length, count - first)))
         first += length
     return made
 
@@ -168,21 +164,26 @@ def launch(
         return
     # The arguments are checked and packed once; each thread has its own copy of them, but for the slice.
     packed = wp.launch(kernel, dim=count, inputs=[0, *inputs], device=device, record_cmd=True)
-    left = deque(slices(count, parts, split_min, align))
-    run_parallel([partial(_take_slices, packed, left)] * min(parts, len(left)))
+    known, spent = (kernel, count.bit_length()), []
+    pieces = round(PIECES_A_ROOT_MS * math.sqrt(1000.0 * count * _measured.get(known, 0.0)))
+    align = align or (SLICE_ALIGN if split_min > SLICE_ALIGN else 1)
+    left = deque(slices(count, parts, min(max(pieces, 1), MOST_PIECES), align))
+    run_parallel([partial(_take_slices, packed, left, spent)] * min(parts, len(left)))
+    _measured[known] = sum(spent) / count
 
 
-def _take_slices(packed: wp.Launch, left: deque[tuple[int, int]]) -> None:
-    """Run slices until none is left to be taken."""
-    own = _own(packed)
+def _take_slices(packed: wp.Launch, left: deque[tuple[int, int]], spent: list[float]) -> None:
+    """Run slices until none is left to be taken; adds the seconds that this took."""
+    start, own = thread_time(), _own(packed)
     while left:
         try:
             first, length = left.popleft()
         except IndexError:  # another thread was faster
-            return
+            break
         own.set_dim(length)
         own.set_param_at_index(0, first)
         own.launch()
+    spent.append(thread_time() - start)
 
 
 def _own(packed: wp.Launch) -> wp.Launch:
@@ -277,10 +278,67 @@ def _compile(module: wp.Module, device: wp.Device) -> None:
 
 
 def run_parallel(jobs: list[Callable[[], None]]) -> None:
-    """Run the callables at the same time, the first on the calling thread; re-raise the first failure."""
+    """Run the callables at the same time, the first on the calling thread; re-raise the first failure.
+
+    What no other thread has begun when the calling one is done, as all cores are busy, that one does itself.
+    """
     if not jobs:
         return
-    waiting = [_pool(max(len(jobs) - 1, 1)).submit(job) for job in jobs[1:]]
-    jobs[0]()
-    for job in waiting:
-        job.result()
+    helpers = [_Helper.begin(job) for job in jobs[1:]]
+    failures: list[BaseException] = []
+    for job in (jobs[0], *(helper.finish for helper in helpers)):
+        try:
+            job()
+        except BaseException as failure:  # others still write to the launch's arrays
+            failures.append(failure)
+    if failures:
+        raise failures[0]
+
+
+class _Helper:
+    """A thread that waits for one job after the other: less goes to and fro than with the futures of a pool."""
+
+    idle: ClassVar[dict[int, list[_Helper]]] = {}  # by process: one that was forked has none of its parent's threads
+
+    def __init__(self):
+        self._job: Callable[[], None] | None = None
+        self._failure: BaseException | None = None
+        self._asked, self._done = threading.Lock(), threading.Lock()
+        self._asked.acquire()
+        self._done.acquire()
+        threading.Thread(target=self._work, name="warp_reflect", daemon=True).start()
+
+    @classmethod
+    def begin(cls, job: Callable[[], None]) -> _Helper:
+        """A helper that is at a job, or will be."""
+        idle = cls.idle.setdefault(os.getpid(), [])
+        try:
+            helper = idle.pop()
+        except IndexError:
+            helper = cls()
+        helper._job = job
+        helper._asked.release()
+        return helper
+
+    def finish(self) -> None:
+        """Wait for the job, or do it where it is not begun; raise its failure."""
+        if self._asked.acquire(blocking=False):
+            job, failure = self._job, None
+        else:
+            self._done.acquire()
+            job, failure = None, self._failure
+        self._job = self._failure = None
+        self.idle[os.getpid()].append(self)
+        if job is not None:
+            job()
+        if failure is not None:
+            raise failure
+
+    def _work(self) -> None:
+        while True:
+            self._asked.acquire()
+            try:
+                self._job()
+            except BaseException as failure:  # raised where it is waited for
+                self._failure = failure
+            self._done.release()
