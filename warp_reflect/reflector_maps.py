@@ -183,10 +183,10 @@ class ReflectorMap:
         device = wp.get_device(device)
         if self.view.texels.device == device:
             return self
-        if device not in self._elsewhere:
+        if device.alias not in self._elsewhere:
             numbers = self.texels, self.unit_from_body, self.extent, self.inner_radius, self.outer_radius
-            self._elsewhere[device] = self._of(*numbers, device).of_geometry(self.geometry)
-        return self._elsewhere[device]
+            self._elsewhere[device.alias] = self._of(*numbers, device).of_geometry(self.geometry)
+        return self._elsewhere[device.alias]
 
     @property
     def resolution(self) -> int:

@@ -13,6 +13,11 @@ if TYPE_CHECKING:
     from warp_reflect.wide_tree import WideTree
 
 
+# On CUDA: triangles of a leaf. Rays through trees of one took 0.77 to 0.84 of the time of Warp's usual four, mirrors' and
+# shadows', in three scenes on an H100; 0.70 to 0.78 through "sah", which the host builds a hundred times as long.
+CUDA_LEAF = 1
+
+
 class Tree:
     """Triangles in a BVH, laid out once and fitted to the points of who asks; several times of a stage may share one.
 
@@ -22,9 +27,13 @@ class Tree:
 
     def __init__(self, points: wp.array, indices: wp.array, groups: np.ndarray | None = None):
         """Lay it out after points, which it keeps; `groups`: of every triangle, each in a branch of its own."""
-        constructor = "lbvh" if points.device.is_cuda else "sah"
+        kind = (
+            {"bvh_constructor": "lbvh", "bvh_leaf_size": CUDA_LEAF}
+            if points.device.is_cuda
+            else {"bvh_constructor": "sah"}
+        )
         of_triangle = None if groups is None else wp.array(groups, dtype=wp.int32, device=points.device)
-        self.mesh = wp.Mesh(points, indices, bvh_constructor=constructor, groups=of_triangle)
+        self.mesh = wp.Mesh(points, indices, groups=of_triangle, **kind)
         self._wide: WideTree | None = None
         self._fitted: wp.array | None = points
 
