@@ -16,6 +16,7 @@ from warp_reflect.shapes import max_abs
 wp.set_module_options({"enable_backward": False})
 
 FACE_COUNT = 6
+SHORTEST = wp.constant(1.2e-38)  # of directions: what is shorter has no inverse in float32
 
 
 @wp.struct
@@ -29,9 +30,9 @@ class CubePoint:
 
 @wp.func
 def project_to_cube(x: wp.vec3) -> wp.vec3:
-    """The point of the cube surface in direction x; +x for a zero vector."""
+    """The point of the cube surface in direction x; +x for a vector shorter than `SHORTEST`."""
     m = max_abs(x)
-    if m == 0.0:
+    if m < SHORTEST:
         return wp.vec3(1.0, 0.0, 0.0)
     return x * (1.0 / m)
 
