@@ -98,7 +98,7 @@ def of_plan(plan: Plan) -> list[str]:
         if not cut and FLAT_LIGHTS & {light.kind for light in plan.scene.data.lights}:
             asked.append("|shadow_starts_vector/flat")
     if seen:
-        asked += ["-surface", "|surface_vector", "-surface/plain", "shade"]
+        asked += ["-surface", "|surface_vector", "-surface/plain"]
     for row in seen:
         on = [row.technique, *(name for name, effect in row.effects.items() if effect.on)]
         asked += [module for name in on for module in ROWS.get(name, ())]

@@ -469,7 +469,7 @@ def seen_radiance_kernel(
     out_radiance[i] = hit_radiance(scene, lights, looks, normals, direct, sky, i, triangle[i], u[i], v[i], direction[i])
 
 
-@wp.kernel
+@wp.kernel(module=PLAIN)
 def mirror_term_kernel(
     first: int,
     pixel: wp.array(dtype=int),
@@ -626,7 +626,8 @@ def shade(
     lights, looks, normals = scene.lights, shown.looks, shown.normals
     picture = wp.empty(count, dtype=wp.vec4, device=device)
     mirror = wp.empty(count, dtype=wp.vec3, device=device)
-    if vector.chosen(kernels, device):
+    vectors = vector.chosen(kernels, device)
+    if vectors:
         from warp_reflect import shade_vector  # which shades with this module's structures
 
         areas = summed_late(scene, shadows)
@@ -642,7 +643,9 @@ def shade(
         radiance = shown.seen(layer)
         if finish is not None:
             radiance = finish(shown, layer, radiance)
-        launch.launch(
-            mirror_term_kernel, layer.pixels.count, [layer.pixels.pixel, radiance, picture, mirror], device, threads
-        )
+        term = [layer.pixels.pixel, radiance, picture, mirror]
+        if vectors:
+            shade_vector.add_mirror_term(*term, threads)
+        else:
+            launch.launch(mirror_term_kernel, layer.pixels.count, term, device, threads)
     return picture, mirror

@@ -1,4 +1,4 @@
-"""`shade.shade_kernel` and `shade.seen_radiance_kernel` for a block of points at a time.
+"""`shade.shade_kernel`, `shade.seen_radiance_kernel` and `shade.mirror_term_kernel` for a block of points at a time.
 
 The same formulas in the same order; lanes differ in their triangle, patch and material. Neighbouring points mostly share a
 patch, whose constants are then read once for a vector. Spheres that shine without shadows are summed here as well, so that
@@ -377,3 +377,63 @@ def shade_rays(
     inputs = [0, scene.view, scene.triangle_records, gbuffer.view, *light, layer.triangle, none(int, device), *rays]
     inputs += [none(wp.vec4, device), none(wp.vec3, device), radiance]
     vector.launch_blocks(shade_blocks_kernel, layer.pixels.count, inputs, device, threads, split_min=HITS_SPLIT_MIN)
+
+
+@wp.func_native(
+    vector.snippet(r"""
+    const int count = pixel.shape[0];
+    const int begin = block * BLOCK;
+    const int end = begin + BLOCK < count ? begin + BLOCK : count;
+    const float* seen = (const float*)radiance.data;
+    float* picture = (float*)out_picture.data;
+    float* mirror = (float*)out_mirror.data;
+    for (int start = begin; start < end; start += LANES) {
+        const int first = pixel.data[start];
+        // Mostly side by side in a row.
+        if (start + LANES <= end && !bits(iload(pixel.data + start) != first + lanes())) {
+            const V term = product(vload(mirror, first), vload(seen, start));
+            float rows[4 * LANES];
+            vstore4(rows, 0, term, F(0.0f));
+            vstore(mirror, first, term);
+            for (int k = 0; k < 4 * LANES; k += LANES)
+                store(picture + 4 * first + k, load(picture + 4 * first + k) + load(rows + k));
+            continue;
+        }
+        const int stop = start + LANES < end ? start + LANES : end;
+        for (int i = start; i < stop; ++i) {
+            const int p = pixel.data[i];
+            for (int c = 0; c < 3; ++c) {
+                const float term = mirror[3 * p + c] * seen[3 * i + c];
+                mirror[3 * p + c] = term;
+                picture[4 * p + c] += term;
+            }
+        }
+    }
+""")
+)
+def mirror_term_block(
+    block: int,
+    pixel: wp.array(dtype=int),
+    radiance: wp.array(dtype=wp.vec3),
+    out_picture: wp.array(dtype=wp.vec4),
+    out_mirror: wp.array(dtype=wp.vec3),
+): ...
+
+
+@wp.kernel
+def mirror_term_blocks_kernel(
+    first: int,
+    pixel: wp.array(dtype=int),
+    radiance: wp.array(dtype=wp.vec3),
+    # Outputs:
+    out_picture: wp.array(dtype=wp.vec4),
+    out_mirror: wp.array(dtype=wp.vec3),
+):
+    """One thread per block of mirror pixels."""
+    mirror_term_block(first + wp.tid(), pixel, radiance, out_picture, out_mirror)
+
+
+def add_mirror_term(pixel: wp.array, radiance: wp.array, picture: wp.array, mirror: wp.array, threads: int) -> None:
+    """What `shade.mirror_term_kernel` does."""
+    inputs = [pixel, radiance, picture, mirror]
+    vector.launch_blocks(mirror_term_blocks_kernel, len(pixel), inputs, picture.device, threads)
