@@ -11,6 +11,7 @@ reflection is any technique's, and only reflectors are followed, what is merely 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from functools import partial
 
 import numpy as np
 import warp as wp
@@ -164,31 +165,21 @@ def onward(
 
     Returns:
         vec3 [n]; `seen` itself where no mirror is met. The layer's statistics get `bounced`: rays followed, and
-        `bounce_limit`: those whose mirror shows the domes as `bounces` ended there.
+        `bounce_limit`: those whose mirror shows the domes as `bounces` ended there, counted when it is asked for.
     """
     device, width = scene.device, gbuffer.camera.size[0]
     index: wp.array | None = None  # of the first layer's rays; None: all
     weight = compact.none(wp.vec3, device)
     first, total = layer, seen
-    for depth in range(bounces + 1):
+    for depth in range(bounces):
         asked = meeting(scene, layer, mirrors.patches)
         n = len(asked)
         if n == 0:
-            break
-        looks = prepare_looks(scene, gbuffer, layer, threads)
-        normals = prepare_normals(scene, gbuffer, layer, threads)
-        point, normal, direction, domes = (wp.empty(n, dtype=wp.vec3, device=device) for _ in range(4))
-        carried = wp.zeros(n, dtype=wp.vec3, device=device)  # of what is too dark nothing is written
-        inputs = [scene.view, scene.lights, looks, normals, layer.triangle, layer.u, layer.v]
-        inputs += [layer.pixels.direction, weight, asked]
-        inputs += [point, normal, direction, carried, domes]
-        launch.launch(reflect_hits_kernel, n, inputs, device, threads, split_min=bvh.TRACE_SPLIT_MIN)
+            return total
+        point, normal, direction, carried, domes = _reflections(scene, gbuffer, layer, asked, weight, threads)
         going = compact.positive(carried)
         if not len(going):
-            break
-        if depth == bounces:
-            add_statistics(first.statistics, {"bounce_limit": len(going)})
-            break
+            return total
         add_statistics(first.statistics, {"bounced": len(going)})
         if total is seen:
             total = wp.clone(seen)
@@ -209,7 +200,35 @@ def onward(
         else:
             bvh.trace_bounced(scene, layer, facet, mirrors.bodies, threads, kernels, width)
         launch.launch(add_bounce_kernel, len(going), [index, weight, domes, met(layer), total], device, threads)
+    first.statistics.later(partial(_ended, scene, gbuffer, mirrors, layer, weight, threads))
     return total
+
+
+def _reflections(
+    scene: Scene, gbuffer: GBuffer, layer: ReflectionLayer, asked: wp.array, weight: wp.array, threads: int
+) -> list[wp.array]:
+    """Points, normals and directions of rays that mirrors reflect, what they carry, and what the domes gave there."""
+    looks, normals = prepare_looks(scene, gbuffer, layer, threads), prepare_normals(scene, gbuffer, layer, threads)
+    point, normal, direction, domes = (wp.empty(len(asked), dtype=wp.vec3, device=scene.device) for _ in range(4))
+    carried = wp.zeros(len(asked), dtype=wp.vec3, device=scene.device)  # of what is too dark nothing is written
+    inputs = [scene.view, scene.lights, looks, normals, layer.triangle, layer.u, layer.v]
+    inputs += [layer.pixels.direction, weight, asked]
+    outputs = [point, normal, direction, carried, domes]
+    where = scene.device, threads
+    launch.launch(reflect_hits_kernel, len(asked), [*inputs, *outputs], *where, split_min=bvh.TRACE_SPLIT_MIN)
+    return outputs
+
+
+def _ended(
+    scene: Scene, gbuffer: GBuffer, mirrors: Mirrors, layer: ReflectionLayer, weight: wp.array, threads: int
+) -> dict[str, int]:
+    """Statistics of the last rays that are followed: how many meet a mirror again."""
+    asked = meeting(scene, layer, mirrors.patches)
+    if not len(asked):
+        return {}
+    *_, carried, _ = _reflections(scene, gbuffer, layer, asked, weight, threads)
+    count = len(compact.positive(carried))
+    return {"bounce_limit": count} if count else {}
 
 
 def _trace_others(
