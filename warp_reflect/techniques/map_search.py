@@ -92,6 +92,13 @@ def is_visible(map: ReflectorMapView, eye: wp.vec3, target: wp.vec3) -> bool:
         s = sample_map(map, project_to_cube(w))
         if wp.length(w) < (1.0 + GAUGE_INSIDE) * wp.length(wp.cw_mul(s.p, map.inv_extent)):
             return False
+        # The body lies behind the plane of its texels: a segment wholly before that misses it.
+        plane = wp.cross(s.p_u, s.p_v)
+        height = wp.dot(plane, s.p)
+        side = wp.where(height < 0.0, -1.0, 1.0)
+        level = (1.0 + GAUGE_INSIDE) * side * height
+        if side * wp.dot(plane, eye) > level and side * wp.dot(plane, target) > level:
+            return True
         if wp.dot(s.n, direction) < 0.0:
             low = t
         else:

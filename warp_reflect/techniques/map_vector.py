@@ -94,6 +94,12 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
                         const V w = add(white_eye, times(t, d));
                         const Sample s = sample(project_to_cube(w));
                         open &= ~(length(w) < (1.0f + gauge_inside) * length(product(s.p, inv_extent)));
+                        const V plane = cross(s.p_u, s.p_v);
+                        const F height = dot(plane, s.p), side = pick(height < 0.0f, F(-1.0f), F(1.0f));
+                        const F level = (1.0f + gauge_inside) * side * height;
+                        const I before = open & (side * dot(plane, eye) > level) & (side * dot(plane, target) > level);
+                        visible |= before;
+                        open &= ~before;
                         const I falls = dot(s.n, direction) < 0.0f;
                         low = pick(falls, t, low);
                         high = pick(falls, high, t);
