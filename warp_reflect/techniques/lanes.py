@@ -124,7 +124,7 @@ REFLECTOR_MAP = r"""
     const float* texels = (const float*)map.texels.data;
     const int resolution = map.resolution;
     const float scale = 0.5f * (float)(resolution - 1);
-    struct Law { F residual, cos_eye, cos_target; };
+    struct Law { V o, v, w_t; F inv_o, inv_v, w_n, residual, cos_eye, cos_target; };
     // cubemap.project_to_cube
     auto project_to_cube = [&](V x) -> V {
         const F m = size(x);
@@ -190,23 +190,21 @@ REFLECTOR_MAP = r"""
     };
     auto measure = [&](const Sample& s, V target) -> Law {
         const V to_eye = sub(eye, s.p), to_target = sub(target, s.p);
-        const V o = times(1.0f / fmax(length(to_eye), F(1.0e-20f)), to_eye);
-        const V v = times(1.0f / fmax(length(to_target), F(1.0e-20f)), to_target);
-        const V w = add(o, v);
         Law law;
-        law.cos_eye = dot(s.n, o);
-        law.cos_target = dot(s.n, v);
-        const F w_n = law.cos_eye + law.cos_target;
-        const F w_t = length(sub(w, times(w_n, s.n)));
-        law.residual = pick(w_n > normal_part_min, w_t * (1.0f / w_n), 1.0e4f - w_n);
+        law.inv_o = 1.0f / fmax(length(to_eye), F(1.0e-20f));
+        law.inv_v = 1.0f / fmax(length(to_target), F(1.0e-20f));
+        law.o = times(law.inv_o, to_eye);
+        law.v = times(law.inv_v, to_target);
+        law.cos_eye = dot(s.n, law.o);
+        law.cos_target = dot(s.n, law.v);
+        law.w_n = law.cos_eye + law.cos_target;
+        law.w_t = sub(add(law.o, law.v), times(law.w_n, s.n));
+        law.residual = pick(law.w_n > normal_part_min, length(law.w_t) * (1.0f / law.w_n), 1.0e4f - law.w_n);
         return law;
     };
-    auto newton_step = [&](const Sample& s, V target) -> V {
-        const V to_eye = sub(eye, s.p), to_target = sub(target, s.p);
-        const F inv_o = 1.0f / fmax(length(to_eye), F(1.0e-20f)), inv_v = 1.0f / fmax(length(to_target), F(1.0e-20f));
-        const V o = times(inv_o, to_eye), v = times(inv_v, to_target), n = s.n;
-        const F n_o = dot(n, o), n_v = dot(n, v), w_n = n_o + n_v;
-        const V w_t = sub(add(o, v), times(w_n, n));
+    auto newton_step = [&](const Sample& s, const Law& law) -> V {
+        const V o = law.o, v = law.v, w_t = law.w_t, n = s.n;
+        const F inv_o = law.inv_o, inv_v = law.inv_v, n_o = law.cos_eye, n_v = law.cos_target, w_n = law.w_n;
         const F n_1 = dot(n, s.p_u), n_2 = dot(n, s.p_v);
         const F o1 = dot(o, s.p_u) - n_o * n_1, o2 = dot(o, s.p_v) - n_o * n_2;
         const F v1 = dot(v, s.p_u) - n_v * n_1, v2 = dot(v, s.p_v) - n_v * n_2;

@@ -59,7 +59,14 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
     int few_count = 0, far_count = 0;
 // Between what is read and what is written of a row: the compiler would make masked stores of them, which are slow.
 #define KEEP_APART(row) asm volatile("" : : "r"(&row) : "memory");
-    struct Search { V target, x, best, p, n, step; F residual, shrink; I asked, going, near, later, used; Cell cell; Sample s; };
+    struct Search {
+        V target, x, best, p, n, step;
+        F residual, shrink;
+        I asked, going, better, near, later, used;
+        Cell cell;
+        Sample s;
+        Law law;
+    };
     constexpr int ROWS = BLOCK / LANES;
     Search group[ROWS];
     // map_search.search_newton. A vector goes on while more than FEW of its lanes do: the others go on side by side after the
@@ -217,6 +224,7 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
                 g.residual = F(1.0e30f);
                 g.shrink = F(1.0f);
                 g.later = g.used = I(0);
+                g.best = g.p = g.n = g.step = same(0.0f);
                 if (in_few) {
                     g.best = at_row(BEST);
                     g.p = at_row(P);
@@ -230,40 +238,49 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
                 open[k] = k;
             }
             while (opened > 0) {
-                // Of all vectors the samples, then the steps, then, of those near a root, the ends of the steps.
+                // Of all vectors the samples, then how good they are, then the steps, then, of those near a root, their ends.
                 int on = 0, near_root[ROWS], near_count = 0;
                 for (int k = 0; k < opened; ++k) group[open[k]].s = sample_cell(group[open[k]].cell);
                 for (int k = 0; k < opened; ++k) {
                     Search& g = group[open[k]];
-                    const V target = g.target;
-                    const F here = measure(g.s, target).residual;
+                    g.law = measure(g.s, g.target);
+                    const F here = g.law.residual;
                     const I better = g.going & (here < g.residual);
                     const V best = vpick(better, g.x, g.best), p = vpick(better, g.s.p, g.p), n = vpick(better, g.s.n, g.n);
-                    V x = g.x, step = g.step;
                     const F residual = pick(better, here, g.residual), shrink = pick(better, F(1.0f), g.shrink * retry_shrink);
                     const I used = g.used + 1;
                     const F least = pick(residual <= accepted, F(shrink_near), F(shrink_min));
                     const I unended = ~(residual <= settings.tolerance) & (shrink >= least);
                     const I going = g.going & unended & (used < settings.iterations);
-                    if (bits(going)) {
-                        step = vpick(better, newton_step(g.s, target), step);
-                        x = vpick(going, step_on_cube(best, p, step, shrink), x);
-                        g.cell = map_cell(x);
-                    }
                     const I near = going & better & (residual * residual <= settings.tolerance);
                     KEEP_APART(g)
-                    g.x = x;
                     g.best = best;
                     g.p = p;
                     g.n = n;
-                    g.step = step;
                     g.residual = residual;
                     g.shrink = shrink;
                     g.used = used;
+                    g.better = better;
                     g.going = going;
                     g.near = near;
                     near_root[near_count] = open[k];
                     near_count += bits(near) != 0;
+                    open[on] = open[k];
+                    on += bits(going) != 0;
+                }
+                opened = on;
+                for (int k = 0; k < opened; ++k) {
+                    Search& g = group[open[k]];
+                    const V step = vpick(g.better, newton_step(g.s, g.law), g.step);
+                    KEEP_APART(g)
+                    g.step = step;
+                }
+                for (int k = 0; k < opened; ++k) {
+                    Search& g = group[open[k]];
+                    const V x = vpick(g.going, step_on_cube(g.best, g.p, g.step, g.shrink), g.x);
+                    KEEP_APART(g)
+                    g.x = x;
+                    g.cell = map_cell(x);
                 }
                 for (int k = 0; k < near_count; ++k) {
                     Search& g = group[near_root[k]];
@@ -282,6 +299,7 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
                     g.residual = residual;
                     g.going &= ~ended;
                 }
+                on = 0;
                 for (int k = 0; k < opened; ++k) {
                     Search& g = group[open[k]];
                     const int left = __builtin_popcount(bits(g.going)), few_left = round < BLOCKS ? FEW : 0;
