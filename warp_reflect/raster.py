@@ -368,7 +368,7 @@ def covers_centre(target: TargetView, a: wp.vec4, b: wp.vec4, c: wp.vec4) -> boo
     return box[0] <= box[2] and box[1] <= box[3]
 
 
-@wp.kernel
+@wp.kernel(module=PLAIN)
 def cull_kernel(
     first: int,
     target: TargetView,

@@ -294,12 +294,6 @@ def cull_blocks_kernel(
                 return draw_rows(x, y, count, a + across_a, b + across_b, c + across_c, I(row_a), I(row_b), I(row_c),
                     I(field[LOW][l]), depth_of);
             };
-            if (y_last - y_first < TILE_ROWS && x_last - x_first < LANES) {
-                // So small that it is drawn sooner than looked for behind others.
-                for (int x = x_first & -LANES; x <= x_last; x += LANES)
-                    draw_at(columns_at(x), y_first, y_last - y_first + 1);
-                continue;
-            }
             for (int y_tile = y_first & -TILE_ROWS; y_tile <= y_last; y_tile += TILE_ROWS) {
                 const int y = y_tile > y_first ? y_tile : y_first;
                 const int count = (y_tile + TILE_ROWS <= y_last ? y_tile + TILE_ROWS : y_last + 1) - y;
