@@ -11,7 +11,8 @@ import warp as wp
 from rooms import CHROME, placed, plane_room, room, sphere, square
 
 import warp_reflect as wr
-from warp_reflect import raster, reflector_maps, surface, surface_vector, vector
+from warp_reflect import raster, raster_vector, reflector_maps, surface, surface_vector, vector
+from warp_reflect.launch import launch
 from warp_reflect.layers import Camera, CameraView, MirrorPixels
 from warp_reflect.raster import make_target, rasterise
 from warp_reflect.scene import CameraData, InstanceData, LightData, MaterialData, Scene, SceneData
@@ -256,6 +257,25 @@ def test_what_cannot_be_drawn_is_the_same_nothing():
     triangles = rng.integers(0, 3000, (2000, 3), dtype=np.int32)
     plain = drawn("plain", screen, triangles, 64, 48)
     np.testing.assert_array_equal(drawn("vector", screen, triangles, 64, 48), plain)
+
+
+@pytest.mark.parametrize("orthographic", [0, 1])
+def test_vertices_are_projected_bit_for_bit(orthographic):
+    """In front of the near plane, on the eye's plane and behind it, in blocks that are not full."""
+    rng = np.random.default_rng(2)
+    view = CameraView()
+    view.orthographic, view.near, view.far = orthographic, 0.5, 40.0
+    view.eye, view.forward = wp.vec3(1.0, 2.0, -0.5), wp.vec3(0.0, 0.6, 0.8)
+    view.x_row, view.y_row = wp.vec4(300.0, 20.0, -4.0, 7.0), wp.vec4(1.0, -250.0, 90.0, 0.3)
+    for count in (1, 63, 64, 65, 1001):
+        places = rng.normal(size=(count, 3)).astype(np.float32) * 5.0
+        places[::7] = np.array(view.eye)
+        points = wp.array(places, dtype=wp.vec3, device=CPU)
+        plain, vectors = (wp.zeros(count, dtype=wp.vec4, device=CPU) for _ in range(2))
+        launch(raster.project_kernel, count, [points, view, plain], CPU, 1)
+        vector.launch_blocks(raster_vector.project_blocks_kernel, count, [points, view, vectors], CPU, 2)
+        assert (plain.numpy()[:, 2] == 0.0).any()
+        np.testing.assert_array_equal(vectors.numpy().view(np.uint32), plain.numpy().view(np.uint32))
 
 
 def scenes():

@@ -71,7 +71,7 @@ def of_view(settings: Settings, device: wp.DeviceLike, casting: bool = False, mi
         casting: Points are tried for what shadows do to them.
         mirrors: There are some, seen or not.
     """
-    asked = ["|vector", "raster", "|raster_vector", "-raster/plain"]
+    asked = ["|vector", "-raster", "|raster_vector", "-raster/plain"]
     if mirrors:
         asked += ["-surface", "|surface_vector"]
     if casting:

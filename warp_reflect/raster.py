@@ -491,7 +491,7 @@ def draw_kernel(
     draw_survivor(target, screen, triangles, ids, id_offset, points, plane_triangles, t, row_first, row_end)
 
 
-@wp.kernel
+@wp.kernel(module=PLAIN)
 def project_kernel(
     first: int, points: wp.array(dtype=wp.vec3), camera: CameraView, out_screen: wp.array(dtype=wp.vec4)
 ):
@@ -768,16 +768,20 @@ def draw_triangles(
     width, height = camera.size
     target = make_target(view, (0, 0, width, height), device)
     screen = wp.empty(len(points), dtype=wp.vec4, device=device)
-    launch(project_kernel, len(points), [points, view, screen], device, threads)
+    vectors = vector.chosen(kernels, device)
+    if vectors:
+        from warp_reflect import raster_vector  # as above
+
+        vector.launch_blocks(raster_vector.project_blocks_kernel, len(points), [points, view, screen], device, threads)
+    else:
+        launch(project_kernel, len(points), [points, view, screen], device, threads)
     for triangles, ids in drawn:
         named = {"id_offset": ids} if isinstance(ids, int) else {"ids": ids}
         rasterise(target, screen, triangles, **named, threads=threads, kernels=kernels)
     triangle = wp.empty(width * height, dtype=int, device=device)
     depth_key = wp.empty(width * height, dtype=float, device=device)
     inputs = [target.key, triangle, depth_key]
-    if vector.chosen(kernels, device):
-        from warp_reflect import raster_vector  # as above
-
+    if vectors:
         vector.launch_blocks(raster_vector.resolve_blocks_kernel, width * height, inputs, device, threads)
     else:
         launch(resolve_kernel, width * height, inputs, device, threads)

@@ -16,6 +16,7 @@ from __future__ import annotations
 import warp as wp
 
 from warp_reflect import vector
+from warp_reflect.layers import CameraView
 from warp_reflect.raster import (
     GUARD,
     PlaneView,
@@ -501,6 +502,43 @@ def draw_blocks_kernel(
                 )
         left = left >> wp.uint64(1)
         i += 1
+
+
+@wp.func_native(
+    vector.snippet(r"""
+    // layers.project
+    const int end = begin + BLOCK < points.shape[0] ? begin + BLOCK : points.shape[0];
+    const float* point_of = (const float*)points.data;
+    const V eye = spread(camera.eye), forward = spread(camera.forward);
+    auto along = [](const auto& row, V p) -> F { return row[0] * p.x + row[1] * p.y + row[2] * p.z + row[3]; };
+    for (int start = begin; start < end; start += LANES) {
+        const bool full = start + LANES <= end;
+        const V p = sub(vrows(point_of, start, full, ipick(start + lanes() < end, start + lanes(), I(start))), eye);
+        const F depth = dot(forward, p);
+        const I before = depth < camera.near;
+        V v = V{along(camera.x_row, p), along(camera.y_row, p), 1.0f - depth / camera.far};
+        if (camera.orthographic == 0) {
+            const F inverse = 1.0f / depth;
+            v = V{pick(before, v.x, v.x * inverse), pick(before, v.y, v.y * inverse), inverse};
+        }
+        v.z = pick(before, F(0.0f), v.z);
+        float rest[4 * LANES];
+        vstore4(full ? (float*)out_screen.data + 4 * start : rest, 0, v, depth);
+        if (!full) __builtin_memcpy((float*)out_screen.data + 4 * start, rest, 4 * sizeof(float) * (end - start));
+    }
+""")
+)
+def project_block(
+    begin: int, points: wp.array(dtype=wp.vec3), camera: CameraView, out_screen: wp.array(dtype=wp.vec4)
+): ...
+
+
+@wp.kernel
+def project_blocks_kernel(
+    first: int, points: wp.array(dtype=wp.vec3), camera: CameraView, out_screen: wp.array(dtype=wp.vec4)
+):
+    """As `raster.project_kernel`, one thread per block of vertices."""
+    project_block((first + wp.tid()) * BLOCK, points, camera, out_screen)
 
 
 @wp.func_native(
