@@ -321,7 +321,7 @@ def test_error_falls_with_the_distance_of_what_is_seen():
 def test_parallax_is_what_solving_for_the_shown_points_finds(size):
     """Where the exact mirror shows the points that the map shows at the pixels, in float64."""
     scene = hall(size)
-    frame = render(scene, "reference", size=(160, 90))
+    frame = render(scene, "reference", size=(96, 54))
     layer = frame.layers[1]
     point, ray = (a.numpy().astype(np.float64) for a in (layer.pixels.point, layer.pixels.direction))
     triangle, t = brute_force(scene, scene.origin, ray, range(scene.parts[0].triangle_count))

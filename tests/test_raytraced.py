@@ -28,6 +28,7 @@ from warp_reflect.settings import Settings, Status, Technique
 from warp_reflect.shapes import facet_normal, intersect_triangle, unit
 from warp_reflect.techniques import raytraced
 
+wp.set_module_options({"enable_backward": False})
 DEVICE = "cpu"
 SPHERE = Shape("quadric", np.eye(4), 1.0, 0.0, 1.0)
 CYLINDER = Shape("quadric", np.eye(4), 0.0, 0.0, 1.0)
