@@ -13,7 +13,8 @@ from warp_reflect.layers import pixel_bounds
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
 @pytest.mark.parametrize("count", [0, 1, 1000])
 def test_marked_elements_are_listed_in_order(count, share, device):
-    marks = np.where(np.random.default_rng(count).random(count) < share, 3, 1).astype(np.uint8)
+    rng = np.random.default_rng(count)
+    marks = np.where(rng.random(count) < share, 3, rng.choice([1, 2, 4, 255], count)).astype(np.uint8)
     given = wp.array(marks, dtype=wp.uint8, device=device)
     expected = np.flatnonzero(marks == 3)
     for way in (launch.as_device, launch.recorded):
@@ -26,13 +27,15 @@ def test_marked_elements_are_listed_in_order(count, share, device):
         assert (all_numbers.numpy()[len(expected) :] == -1).all()
 
 
-def test_elements_are_taken_and_put_back(device):
+@pytest.mark.parametrize("way", [launch.as_device, launch.recorded])
+def test_elements_are_taken_and_put_back(way, device):
     values = np.arange(30, dtype=np.float32).reshape(10, 3)
     array, numbers = wp.array(values, dtype=wp.vec3, device=device), wp.array([7, 0, 4], dtype=int, device=device)
-    some = compact.taken(array, numbers)
-    np.testing.assert_array_equal(some.numpy(), values[[7, 0, 4]])
     changed = wp.zeros(10, dtype=wp.vec3, device=device)
-    compact.put(changed, numbers, some)
+    with way():
+        some = compact.taken(array, numbers)
+        compact.put(changed, numbers, some)
+    np.testing.assert_array_equal(some.numpy(), values[[7, 0, 4]])
     np.testing.assert_array_equal(changed.numpy(), np.where(np.isin(np.arange(10), [7, 0, 4])[:, None], values, 0.0))
 
 

@@ -93,7 +93,8 @@ def main() -> int:
         check_layers(str(Path(path).absolute()), Limits(root=root))
         print(_digest(path, root))
     except (ValueError, OSError) as fault:
-        print(fault, file=sys.stderr)
+        # The last line alone is told, and a file's name may have line ends.
+        print(str(fault).replace("\n", " "), file=sys.stderr)
         return 1
     return 0
 
