@@ -77,39 +77,63 @@ HITS = r"""
     auto from_quadric = [&](const Quadric& of, V g) -> V {
         return add(add(times(g.x, of.row[0]), times(g.y, of.row[1])), times(g.z, of.row[2]));
     };
-    // The normals of triangles' corners, where they have any, and theirs in between, of any length.
-    struct Corners { I first, smooth; V n0, n1, n2; };
-    const int* normal_index = (const int*)scene.normal_index.data;
-    auto corners_of = [&](I tri) -> Corners {
-        Corners of;
-        of.first = igather(normal_index, 3 * tri);
-        of.smooth = of.first >= 0;
-        return of;
+    // Triangles of lanes. In memory: addresses are made of their numbers one by one, which takes them out of a vector anew
+    // for every array that is read.
+    struct Triangles { int of[LANES]; bool alone; };
+    auto triangles_of = [&](I tri) -> Triangles {
+        Triangles t;
+        istore(t.of, tri);
+        asm("" : "+m"(t.of));
+        t.alone = !bits(tri != tri[0]);
+        return t;
     };
-    auto between = [&](Corners& of, I tri, F u, F v) -> V {
-        const float* all = (const float*)scene.normals.data;
-        if (!bits(tri != tri[0]) && of.first[0] >= 0) {
-            const int* index = normal_index + 3 * tri[0];
-            of.n0 = spread(all + 3 * index[0]);
-            of.n1 = spread(all + 3 * index[1]);
-            of.n2 = spread(all + 3 * index[2]);
-            return add(add(times(1.0f - u - v, of.n0), times(u, of.n1)), times(v, of.n2));
+    auto patch_of = [&](const Triangles& t) -> I {
+        const int* all = scene.triangle_patch.data;
+        I patch = I(all[t.of[0]]);
+        if (!t.alone) EACH_LANE patch[l] = all[t.of[l]];
+        return patch;
+    };
+    // Values at their corners, by index, where they have any.
+    struct Corners { V a, b, c; I has; };
+    auto at_corners = [&](const Triangles& t, const auto& indices, const auto& values) -> Corners {
+        Corners at = {};
+        const int* index = (const int*)indices.data;
+        const float* value = (const float*)values.data;
+        if (t.alone) {
+            const int* own = index + 3 * t.of[0];
+            if (own[0] < 0) return at;
+            return Corners{spread(value + 3 * own[0]), spread(value + 3 * own[1]), spread(value + 3 * own[2]), I(-1)};
         }
-        of.n0 = vgather(all, ipick(of.smooth, of.first, I(0)));
-        of.n1 = vgather(all, ipick(of.smooth, igather(normal_index, 3 * tri + 1), I(0)));
-        of.n2 = vgather(all, ipick(of.smooth, igather(normal_index, 3 * tri + 2), I(0)));
-        return add(add(times(1.0f - u - v, of.n0), times(u, of.n1)), times(v, of.n2));
+        EACH_LANE at.has[l] = index[3 * t.of[l]];
+        at.has = at.has >= 0;
+        if (!bits(at.has)) return at;
+        auto corner = [&](int k) -> V {
+            V v;
+            EACH_LANE {
+                const int i = index[3 * t.of[l] + k];
+                const float* q = value + 3 * (i < 0 ? 0 : i);
+                v.x[l] = q[0]; v.y[l] = q[1]; v.z[l] = q[2];
+            }
+            return v;
+        };
+        at.a = corner(0); at.b = corner(1); at.c = corner(2);
+        return at;
+    };
+    auto normals_of = [&](const Triangles& t) -> Corners { return at_corners(t, scene.normal_index, scene.normals); };
+    // What lies in between: normals of any length.
+    auto between = [&](const Corners& of, F u, F v) -> V {
+        return add(add(times(1.0f - u - v, of.a), times(u, of.b)), times(v, of.c));
     };
     // surface.hit_normal at points p of lanes `seen`; what its parts were is left in `of` and, in the quadric's frame, `q`.
     // `facet` gives the triangles' own, and is asked only where they matter.
-    auto hit_normal = [&](I seen, I tri, I patch, I quadric, const auto& facet, V p, F u, F v, Corners& smooth, Quadric& of,
+    auto hit_normal = [&](I seen, I patch, I quadric, const auto& facet, V p, F u, F v, const Corners& smooth, Quadric& of,
                           V& q) -> V {
         V n = same(0.0f);
-        if (bits(seen & ~smooth.smooth & ~quadric)) n = facet();
-        if (bits(seen & smooth.smooth)) {
-            const V mixed = between(smooth, tri, u, v);
+        if (bits(seen & ~smooth.has & ~quadric)) n = facet();
+        if (bits(seen & smooth.has)) {
+            const V mixed = between(smooth, u, v);
             const V kept = vpick(dot(mixed, mixed) < 0.01f, V{F(0.0f), F(0.0f), F(1.0f)}, unit(mixed));
-            n = vpick(smooth.smooth, kept, n);
+            n = vpick(smooth.has, kept, n);
         }
         if (bits(seen & quadric)) {
             of = quadric_of(patch);
@@ -118,5 +142,5 @@ HITS = r"""
         }
         return n;
     };
-    (void)place; (void)sight; (void)eye_weights; (void)of_patch; (void)hit_normal;
+    (void)place; (void)sight; (void)eye_weights; (void)of_patch; (void)patch_of; (void)normals_of; (void)hit_normal;
 """

@@ -21,6 +21,7 @@ from warp_reflect.textures import Look
 
 wp.set_module_options({"enable_backward": False})
 
+EYE_BLOCKS = 4  # blocks of pixels a task: what does not change along them (lights, camera) is spread into vectors once
 HITS_SPLIT_MIN = 16  # blocks of rays; those of a few pixels meet triangles all over the scene, at 8 us a block
 
 
@@ -31,8 +32,9 @@ HITS_SPLIT_MIN = 16  # blocks of rays; those of a few pixels meet triangles all 
         + r"""
     const float pi = 3.14159265358979f;
     const int count = triangle.shape[0];
-    const int begin = block * BLOCK;
-    const int end = begin + BLOCK < count ? begin + BLOCK : count;
+    const int span = blocks * BLOCK;
+    const int begin = task * span;
+    const int end = begin + span < count ? begin + span : count;
     // shade.dome_radiance
     auto dome_radiance = [&](I mask, V d) -> V {
         const F slope = dot(spread(lights.sky_slope), d);
@@ -77,8 +79,7 @@ HITS_SPLIT_MIN = 16  # blocks of rays; those of a few pixels meet triangles all 
     constexpr int look_words = sizeof(*looks.data) / 4, material_words = sizeof(*materials) / 4;
     static_assert(look_words == 18, "a look is what is read here");
     const float* table = looked_up ? (const float*)looks.data : (const float*)materials;
-    const int* color_index = (const int*)scene.color_index.data;
-    const bool colored = scene.color_index.shape[0] > 0 && !looked_up;
+    const bool have_colors = scene.color_index.shape[0] > 0 && !looked_up;
     float* picture = (float*)out_picture.data;
     float* mirrors = (float*)out_mirror.data;
     float* radiance = (float*)out_radiance.data;
@@ -93,11 +94,13 @@ HITS_SPLIT_MIN = 16  # blocks of rays; those of a few pixels meet triangles all 
         if (of_eye != 0) reflector = irow(reflector_id.data, start, full, own) > 0;
 
         // textures.plain_look without the mesh's colours, or what was looked up before.
-        I patch = I(0), at = I(0), has_color = I(0), even = I(0), bare = I(0);
+        Triangles triangles;
+        I patch = I(0), at = I(0), colored = I(0), even = I(0), bare = I(0);
         V base_color, f0, f90, emissive;
         F roughness, clearcoat = F(0.0f), clearcoat_roughness, clearcoat_f0, opacity, through;
         if (bits(seen)) {
-            patch = igather(scene.triangle_patch.data, tri);
+            triangles = triangles_of(tri);
+            patch = patch_of(triangles);
             at = looked_up ? look_words * own : material_words * of_patch(&patches->material, patch);
             const bool alone = !bits(at != at[0]);
             F field[18];
@@ -116,13 +119,12 @@ HITS_SPLIT_MIN = 16  # blocks of rays; those of a few pixels meet triangles all 
             emissive = V{field[9], field[10], field[11]};
             roughness = field[12]; clearcoat = field[13]; clearcoat_roughness = field[14]; clearcoat_f0 = field[15];
             opacity = field[16]; through = field[17];
-            if (colored) {
+            if (have_colors) {
                 const int* uses = &materials->uses_vertex_color;
-                has_color = alone ? I(uses[at[0]]) != 0 : igather(uses, at) != 0;
-                if (bits(seen & has_color)) has_color &= igather(color_index, 3 * tri) >= 0;
+                colored = alone ? I(uses[at[0]]) != 0 : igather(uses, at) != 0;
             }
             // What mirrors as much at any angle, and gives back nothing besides.
-            even = (f0.x == f90.x) & (f0.y == f90.y) & (f0.z == f90.z) & ~has_color;
+            even = (f0.x == f90.x) & (f0.y == f90.y) & (f0.z == f90.z) & ~colored;
             bare = seen & reflector & even & ~(clearcoat > 0.0f);
         }
 
@@ -155,12 +157,14 @@ HITS_SPLIT_MIN = 16  # blocks of rays; those of a few pixels meet triangles all 
 
                 V p0, p1, p2;
                 corners(records.data, tri, p0, p1, p2);
-                const I shape = of_patch(&patches->shape, patch);
-                Corners smooth = corners_of(tri);
-                const I quadric = (shape == 1) & ~smooth.smooth;
+                const Corners smooth = normals_of(triangles);
+                Corners colors = {};
+                if (bits(seen & colored)) colors = at_corners(triangles, scene.color_index, scene.colors);
+                const I has_color = colored & colors.has;
+                const I quadric = (of_patch(&patches->shape, patch) == 1) & ~smooth.has;
                 F u = F(0.0f), v = F(0.0f);
                 V p = same(0.0f);
-                if (bits(seen & (smooth.smooth | quadric | has_color)) || areas.shape[0] > 0) {
+                if (bits(seen & (smooth.has | quadric | has_color)) || areas.shape[0] > 0) {
                     if (of_eye != 0) {
                         eye_weights(eye, p0, p1, p2, u, v);
                     } else {
@@ -170,11 +174,7 @@ HITS_SPLIT_MIN = 16  # blocks of rays; those of a few pixels meet triangles all 
                     p = add(add(times(1.0f - u - v, p0), times(u, p1)), times(v, p2));
                 }
                 if (bits(seen & has_color)) {
-                    const float* all = (const float*)scene.colors.data;
-                    const V c0 = vgather(all, ipick(has_color, igather(color_index, 3 * tri), I(0)));
-                    const V c1 = vgather(all, ipick(has_color, igather(color_index, 3 * tri + 1), I(0)));
-                    const V c2 = vgather(all, ipick(has_color, igather(color_index, 3 * tri + 2), I(0)));
-                    const V mixed = add(add(times(1.0f - u - v, c0), times(u, c1)), times(v, c2));
+                    const V mixed = between(colors, u, v);
                     base_color = vpick(has_color, mixed, base_color);
                     const F metallic = gather(&materials->metallic, at);
                     const I metal = has_color & (metallic > 0.0f);
@@ -186,7 +186,7 @@ HITS_SPLIT_MIN = 16  # blocks of rays; those of a few pixels meet triangles all 
                 Quadric of;
                 V q;
                 auto facet = [&]() -> V { return facet_normal(p0, p1, p2); };
-                V n = hit_normal(seen, tri, patch, quadric, facet, p, u, v, smooth, of, q);
+                V n = hit_normal(seen, patch, quadric, facet, p, u, v, smooth, of, q);
                 if (normals.shape[0] > 0) {
                     const V mapped = vrows((const float*)normals.data, start, full, own);
                     n = vpick(dot(mapped, mapped) > 0.0f, mapped, n);
@@ -271,7 +271,8 @@ HITS_SPLIT_MIN = 16  # blocks of rays; those of a few pixels meet triangles all 
     )
 )
 def shade_block(
-    block: int,
+    task: int,
+    blocks: int,
     of_eye: int,
     scene: SceneView,
     records: wp.array(dtype=float),
@@ -298,6 +299,7 @@ def shade_block(
 @wp.kernel
 def shade_blocks_kernel(
     first: int,
+    blocks: int,
     of_eye: int,
     scene: SceneView,
     records: wp.array(dtype=float),
@@ -320,9 +322,10 @@ def shade_blocks_kernel(
     out_mirror: wp.array(dtype=wp.vec3),
     out_radiance: wp.array(dtype=wp.vec3),
 ):
-    """One thread per block of pixels that the eye sees, or of rays, whose arrays are then those of length 0."""
+    """One thread per some blocks of pixels that the eye sees, or of rays, whose arrays are then those of length 0."""
     shade_block(
         first + wp.tid(),
+        blocks,
         of_eye,
         scene,
         records,
@@ -355,6 +358,7 @@ def shade_eye(scene: Scene, gbuffer: GBuffer, light: list, picture: wp.array, mi
     device = scene.device
     rays = [none(wp.vec3, device), none(float, device), none(float, device)]
     inputs = [
+        EYE_BLOCKS,
         1,
         scene.view,
         scene.triangle_records,
@@ -365,7 +369,7 @@ def shade_eye(scene: Scene, gbuffer: GBuffer, light: list, picture: wp.array, mi
         *rays,
     ]
     inputs += [picture, mirror, none(wp.vec3, device)]
-    vector.launch_blocks(shade_blocks_kernel, len(gbuffer.triangle), inputs, device, threads)
+    vector.launch_blocks(shade_blocks_kernel, len(gbuffer.triangle), inputs, device, threads, blocks=EYE_BLOCKS)
 
 
 def shade_rays(
@@ -374,7 +378,7 @@ def shade_rays(
     """What `shade.seen_radiance_kernel` does; `light` as in `shade_eye`."""
     device = scene.device
     rays = [layer.pixels.direction, layer.u, layer.v]
-    inputs = [0, scene.view, scene.triangle_records, gbuffer.view, *light, layer.triangle, none(int, device), *rays]
+    inputs = [1, 0, scene.view, scene.triangle_records, gbuffer.view, *light, layer.triangle, none(int, device), *rays]
     inputs += [none(wp.vec4, device), none(wp.vec3, device), radiance]
     vector.launch_blocks(shade_blocks_kernel, layer.pixels.count, inputs, device, threads, split_min=HITS_SPLIT_MIN)
 

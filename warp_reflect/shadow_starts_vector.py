@@ -54,6 +54,7 @@ FLAT = module_part(__name__, "flat")
         }
         const I tri = ipick(seen, known, I(0));
         const I number = pixel.shape[0] > 0 ? igather(pixel.data, own) : own;
+        const Triangles triangles = triangles_of(tri);
         V p0, p1, p2, way;
         F u, v;
         corners(records.data, tri, p0, p1, p2);
@@ -73,22 +74,22 @@ FLAT = module_part(__name__, "flat")
         const F w = 1.0f - u - v;
         const V at = add(add(times(w, p0), times(u, p1)), times(v, p2));
         const V facet = facet_normal(p0, p1, p2);
-        const I patch = igather(scene.triangle_patch.data, tri);
-        Corners smooth = corners_of(tri);
-        const I quadric = (of_patch(&patches->shape, patch) == shape_quadric) & ~smooth.smooth;
+        const I patch = patch_of(triangles);
+        const Corners smooth = normals_of(triangles);
+        const I quadric = (of_patch(&patches->shape, patch) == shape_quadric) & ~smooth.has;
         Quadric of;
         V q;
-        V n = hit_normal(seen, tri, patch, quadric, [&]() -> V { return facet; }, at, u, v, smooth, of, q), p = at;
+        V n = hit_normal(seen, patch, quadric, [&]() -> V { return facet; }, at, u, v, smooth, of, q), p = at;
         const F turned = pick(dot(n, way) > 0.0f, F(-1.0f), F(1.0f));
         const V side = times(pick(dot(facet, n) < 0.0f, -turned, turned), facet);
-        if (bits(seen & smooth.smooth)) {
+        if (bits(seen & smooth.has)) {
             auto above_tangent = [&](V from, V corner, V normal) -> V {
                 return times(fmax(dot(sub(corner, from), normal), F(0.0f)), normal);
             };
-            V raised = add(p, times(w, above_tangent(p, p0, times(turned, smooth.n0))));
-            raised = add(raised, times(u, above_tangent(raised, p1, times(turned, smooth.n1))));
-            raised = add(raised, times(v, above_tangent(raised, p2, times(turned, smooth.n2))));
-            p = vpick(smooth.smooth, raised, p);
+            V raised = add(p, times(w, above_tangent(p, p0, times(turned, smooth.a))));
+            raised = add(raised, times(u, above_tangent(raised, p1, times(turned, smooth.b))));
+            raised = add(raised, times(v, above_tangent(raised, p2, times(turned, smooth.c))));
+            p = vpick(smooth.has, raised, p);
         }
         if (bits(seen & quadric)) {
             const F f = q.x * q.x + q.y * q.y + (of.a * q.z + of.b) * q.z - of.c;

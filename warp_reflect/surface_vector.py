@@ -45,7 +45,8 @@ LISTED_IDS = 32  # each has a number in every block of pixels
         const Sight of_eye = sight(column + 0.5f, line + 0.5f);
         const V ray = of_eye.ray;
         const I tri = igather(triangle.data, at);
-        const I patch = igather(scene.triangle_patch.data, tri);
+        const Triangles triangles = triangles_of(tri);
+        const I patch = patch_of(triangles);
         const I shape = of_patch(&patches->shape, patch);
         Quadric of;
         if (bits(shape != 0)) of = quadric_of(patch);
@@ -81,10 +82,10 @@ LISTED_IDS = 32  # each has a number in every block of pixels
             V at_scene = add(add(times(w, p0), times(u, p1)), times(v, p2));
             const V way = parallel ? incident : unit(add(add(times(w, a), times(u, b)), times(v, c)));
             V turned = facet_normal(a, b, c);
-            Corners smooth = corners_of(tri);
-            if (bits(smooth.smooth)) {
-                const V mixed = between(smooth, tri, u, v);
-                turned = vpick(smooth.smooth & (dot(mixed, mixed) >= least_normal * least_normal), unit(mixed), turned);
+            const Corners smooth = normals_of(triangles);
+            if (bits(smooth.has)) {
+                const V mixed = between(smooth, u, v);
+                turned = vpick(smooth.has & (dot(mixed, mixed) >= least_normal * least_normal), unit(mixed), turned);
             }
             const I flat = shape == shape_plane;
             if (bits(flat)) {
