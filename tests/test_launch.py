@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import threading
 import time
+import weakref
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -52,6 +55,38 @@ def test_a_launch_meets_every_element_once(threads):
     launch.launch(count_up_kernel, count, [step, times, runs], "cpu", threads, align=step)
     assert (times.numpy() == 1).all()
     np.testing.assert_array_equal(runs.numpy(), [*[step] * (count // step), count % step])
+
+
+@wp.kernel
+def add_kernel(first: int, given: wp.array(dtype=Any), more: float, out_sum: wp.array(dtype=Any)):
+    i = first + wp.tid()
+    out_sum[i] = given[i] + given.dtype(more)
+
+
+def test_launches_of_one_kernel_differ_in_their_arguments_alone():
+    """Of a kernel for many types, too; what is wrong is told at every launch, and no array is kept."""
+    for kind, host in ((float, np.float32), (wp.float64, np.float64), (float, np.float32)):
+        for count, more in ((3, 0.5), (5000, 2.0)):
+            given = wp.array(np.arange(count), dtype=kind, device="cpu")
+            out = wp.zeros(count, dtype=kind, device="cpu")
+            launch.launch(add_kernel, count, [given, more, out], "cpu", 2)
+            np.testing.assert_array_equal(out.numpy(), np.arange(count, dtype=host) + more)
+    times, runs = (wp.zeros(5000, dtype=int, device="cpu") for _ in range(2))
+    for step in (1, 5000):
+        launch.launch(count_up_kernel, 5000, [step, times, runs], "cpu", 1)
+    assert runs.numpy()[:2].tolist() == [5001, 1] and (times.numpy() == 2).all()
+    wrong = wp.zeros(5000, dtype=float, device="cpu")
+    for inputs, message in (
+        ([1, times, wrong], "dtype"),
+        ([1, times], "arguments"),
+        ([1, times, None, 1], "arguments"),
+    ):
+        with pytest.raises(RuntimeError, match=message):
+            launch.launch(count_up_kernel, 5000, inputs, "cpu", 1)
+    gone = weakref.ref(wrong)
+    del wrong, inputs
+    gc.collect()
+    assert gone() is None
 
 
 @pytest.mark.parametrize("failing", [0, 1, 2])

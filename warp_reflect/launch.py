@@ -53,6 +53,7 @@ FINITE_FLAGS = (
 
 # Of launches that were split, by their kernel and (binary) order of magnitude: what an element took last time. [s]
 _measured: dict[tuple[wp.Kernel, int], float] = {}
+_made: dict[wp.Kernel, wp.Launch] = {}
 _recordings: list[list[tuple[str, int]]] = []
 _as_device: list[bool] = []
 _loaded: dict[tuple, Future] = {}
@@ -157,13 +158,12 @@ def launch(
     if device.is_cuda:
         wp.launch(kernel, dim=count, inputs=[0, *inputs], device=device, block_dim=CUDA_BLOCK_DIM)
         return
-    _load(kernel, device)
+    # The arguments are checked and packed once; each thread has its own copy of them, but for the slice.
+    packed = _packed(kernel, count, inputs, device)
     parts = shared_by(count, device, threads, split_min)
     if parts == 1:
-        wp.launch(kernel, dim=count, inputs=[0, *inputs], device=device)
+        packed.launch()
         return
-    # The arguments are checked and packed once; each thread has its own copy of them, but for the slice.
-    packed = wp.launch(kernel, dim=count, inputs=[0, *inputs], device=device, record_cmd=True)
     known, spent = (kernel, count.bit_length()), []
     pieces = round(PIECES_A_ROOT_MS * math.sqrt(1000.0 * count * _measured.get(known, 0.0)))
     align = align or (SLICE_ALIGN if split_min > SLICE_ALIGN else 1)
@@ -186,10 +186,40 @@ def _take_slices(packed: wp.Launch, left: deque[tuple[int, int]], spent: list[fl
     spent.append(thread_time() - start)
 
 
+def _packed(kernel: wp.Kernel, count: int, inputs: list, device) -> wp.Launch:
+    """A launch on the CPU, ready to run.
+
+    The first one of a kernel is made by Warp and kept, without its arrays. The others differ from it in their arguments: an
+    array of just the declared kind is taken as it is, anything else is looked at by Warp.
+    """
+    made, arguments = _made.get(kernel), kernel.adj.args
+    if (
+        made is None
+        or len(inputs) + 1 != len(arguments)
+        or made.module_exec is not kernel.module.load(device, CPU_BLOCK_DIM)
+    ):
+        _load(kernel, device)
+        made = wp.launch(kernel, dim=count, inputs=[0, *inputs], device=device, record_cmd=True)
+        if made.kernel is kernel:  # and not the one of several that the arguments' types ask for
+            _made[kernel] = _own(made)
+            _made[kernel].fwd_args = []
+        return made
+    own = _own(made)
+    own.fwd_args = [0, *inputs]
+    for k, value in enumerate(inputs, 1):
+        kind = arguments[k].type
+        if type(value) is wp.array is type(kind) and value.dtype is kind.dtype and value.ndim == kind.ndim:
+            own.params[k + 1] = value.__ctype__()
+        else:
+            own.set_param_at_index(k, value)
+    own.set_dim(count)
+    return own
+
+
 def _own(packed: wp.Launch) -> wp.Launch:
     """A launch with the same arguments, some of which may be set."""
     own = copy(packed)
-    own.params = list(packed.params)
+    own.params, own.fwd_args = list(packed.params), list(getattr(packed, "fwd_args", ()))
     return own
 
 
@@ -207,8 +237,7 @@ def launch_bands(kernel, count: int, bands: list[tuple[int, int]], inputs: list,
     if count <= 0 or not bands:
         return
     _record(kernel, count)
-    _load(kernel, device)
-    packed = wp.launch(kernel, dim=count, inputs=[0, *inputs, *bands[0]], device=device, record_cmd=True)
+    packed = _packed(kernel, count, [*inputs, *bands[0]], device)
 
     def draw(band: tuple[int, int]) -> None:
         own = _own(packed)
