@@ -245,13 +245,19 @@ def bench(stage: str, arguments: argparse.Namespace, peaks: Peaks) -> list[dict]
     frame = wr.render_frame(scene, plan)
     works: dict[str, Work] = defaultdict(Work)
     spent: Counter = Counter()
-    launch = wp.launch
+    launch, run_command = wp.launch, wp.Launch.launch
 
     def timed(kernel, dim, inputs=(), device=None, **how):
         start = time.thread_time()
-        launch(kernel, dim=dim, inputs=inputs, device=device, **how)
+        command = launch(kernel, dim=dim, inputs=inputs, device=device, **how)
         spent[kernel.key] += 1000.0 * (time.thread_time() - start)
         elements[kernel.key] += dim
+        return command
+
+    def timed_command(command, *given):
+        start = time.thread_time()
+        run_command(command, *given)
+        spent[command.kernel.key] += 1000.0 * (time.thread_time() - start)
 
     def counted(kernel, dim, inputs=(), device=None, **how):
         work = works[kernel.key]
@@ -260,12 +266,12 @@ def bench(stage: str, arguments: argparse.Namespace, peaks: Peaks) -> list[dict]
         if chosen[kernel.key]:
             steps = max(int(arguments.steps * dim / chosen[kernel.key]), 1)
             count_instructions(kernel, dim, inputs, steps, work, rng, launch)
-        launch(kernel, dim=dim, inputs=inputs, device=device, **how)
+        return launch(kernel, dim=dim, inputs=inputs, device=device, **how)
 
     times: list[Counter] = []
     whole: list[float] = []
     try:
-        wp.launch = timed
+        wp.launch, wp.Launch.launch = timed, timed_command
         for round_ in range(arguments.rounds + 1):
             spent.clear()
             elements: Counter = Counter()
@@ -281,7 +287,7 @@ def bench(stage: str, arguments: argparse.Namespace, peaks: Peaks) -> list[dict]
         wp.launch = counted
         wr.render_frame(scene, plan, previous=frame)
     finally:
-        wp.launch = launch
+        wp.launch, wp.Launch.launch = launch, run_command
     told = disassembled({address for work in works.values() for address in work.counts})
     rows = []
     for kernel in sorted(chosen, key=lambda kernel: -ms[kernel]):
