@@ -357,7 +357,9 @@ def snippet(body: str, elsewhere: str = "", wide: bool = False, exact: bool = Fa
     head = _HEAD.replace("#if defined(__AVX512F__)", "#if 1") if wide else _HEAD
     if exact:
         head = "#pragma clang fp contract(off)\n" + head
-    return f"#if !defined(__CUDACC_RTC__) && !defined(__CUDA_ARCH__)\n{head}{body}\n#else\n{elsewhere}\n#endif\n"
+    # Warp builds every kernel twice, for arrays with and without gaps between elements; this is in both, and built once.
+    once = f"auto whole_task = [&]() __attribute__((noinline)) {{\n{head}{body}\n}};\nreturn whole_task();\n"
+    return f"#if !defined(__CUDACC_RTC__) && !defined(__CUDA_ARCH__)\n{once}#else\n{elsewhere}\n#endif\n"
 
 
 def block_count(count: int) -> int:
