@@ -121,6 +121,47 @@ def reflect_hits_kernel(
 
 
 @wp.kernel
+def take_rays_kernel(
+    first: int,
+    # Rays that go on, as numbers of those asked for, and what is known of all of these:
+    going: wp.array(dtype=int),
+    asked: wp.array(dtype=int),
+    point: wp.array(dtype=wp.vec3),
+    normal: wp.array(dtype=wp.vec3),
+    direction: wp.array(dtype=wp.vec3),
+    weight: wp.array(dtype=wp.vec3),
+    domes: wp.array(dtype=wp.vec3),
+    # Of the layer's rays:
+    triangle: wp.array(dtype=int),
+    pixel: wp.array(dtype=int),
+    index: wp.array(dtype=int),
+    # Outputs:
+    out_point: wp.array(dtype=wp.vec3),
+    out_normal: wp.array(dtype=wp.vec3),
+    out_direction: wp.array(dtype=wp.vec3),
+    out_weight: wp.array(dtype=wp.vec3),
+    out_domes: wp.array(dtype=wp.vec3),
+    out_facet: wp.array(dtype=int),
+    out_pixel: wp.array(dtype=int),
+    out_index: wp.array(dtype=int),
+):
+    """One thread per ray that goes on; `index` of length 0: the layer's rays are the first ones."""
+    k = first + wp.tid()
+    i = going[k]
+    ray = asked[i]
+    out_point[k] = point[i]
+    out_normal[k] = normal[i]
+    out_direction[k] = direction[i]
+    out_weight[k] = weight[i]
+    out_domes[k] = domes[i]
+    out_facet[k] = triangle[ray]
+    out_pixel[k] = pixel[ray]
+    out_index[k] = ray
+    if index.shape[0] > 0:
+        out_index[k] = index[ray]
+
+
+@wp.kernel
 def add_bounce_kernel(
     first: int,
     index: wp.array(dtype=int),
@@ -168,7 +209,7 @@ def onward(
         `bounce_limit`: those whose mirror shows the domes as `bounces` ended there, counted when it is asked for.
     """
     device, width = scene.device, gbuffer.camera.size[0]
-    index: wp.array | None = None  # of the first layer's rays; None: all
+    index = compact.none(int, device)  # of the first layer's rays; length 0: all
     weight = compact.none(wp.vec3, device)
     first, total = layer, seen
     for depth in range(bounces):
@@ -183,13 +224,11 @@ def onward(
         add_statistics(first.statistics, {"bounced": len(going)})
         if total is seen:
             total = wp.clone(seen)
-        taken = lambda array: compact.taken(array, going)  # noqa: B023, E731
-        if len(going) < n:
-            asked, point, normal, direction, carried, domes = map(
-                taken, (asked, point, normal, direction, carried, domes)
-            )
-        index, weight = asked if index is None else compact.taken(index, asked), carried
-        facet, pixel = (compact.taken(array, asked) for array in (layer.triangle, layer.pixels.pixel))
+        known = [going, asked, point, normal, direction, carried, domes, layer.triangle, layer.pixels.pixel, index]
+        point, normal, direction, weight, domes = (wp.empty(len(going), dtype=wp.vec3, device=device) for _ in range(5))
+        facet, pixel, index = (wp.empty(len(going), dtype=int, device=device) for _ in range(3))
+        taken = [point, normal, direction, weight, domes, facet, pixel, index]
+        launch.launch(take_rays_kernel, len(going), [*known, *taken], device, threads)
         pixels = MirrorPixels(layer.pixels.reflector, pixel, point, normal, direction, layer.pixels.box)
         make = ReflectionLayer.unset if forward is None or depth else ReflectionLayer.empty
         layer = make(pixels, Technique.RAYTRACED, device)

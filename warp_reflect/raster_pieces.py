@@ -24,7 +24,9 @@ PIECE_WIDTH = wp.constant(16)
 PIECE_HEIGHT = wp.constant(8)
 # Threads that take pieces: about as many as a large device (132 multiprocessors) holds at a time.
 TAKERS = 1 << 17
-COUNT_SHIFT = wp.constant(wp.int64(38))  # of the counter: below it pieces, a million pictures full; above, 33 million triangles
+COUNT_SHIFT = wp.constant(
+    wp.int64(38)
+)  # of the counter: below it pieces, a million pictures full; above, 33 million triangles
 ONE = wp.constant(wp.int64(1))
 
 
