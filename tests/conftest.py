@@ -9,6 +9,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -191,10 +192,14 @@ def _worker(config: pytest.Config) -> tuple[int, int]:
 
 
 def _compile_once(locks: Path) -> None:
-    """Of several processes one compiles a kernel module; the others wait for it, and find it in Warp's cache."""
+    """Of several processes one compiles a kernel module; the others wait for it, and find it in Warp's cache.
+
+    Each compiles one module at a time: every thread that compiles makes a precompiled header first.
+    """
     import fcntl
 
     compile_module = launch._compile
+    launch._compilers = cache(lambda flags, process: ThreadPoolExecutor(1, "warp_reflect_compile"))
 
     def compile_alone(module: wp.Module, device: wp.Device) -> None:
         with open(locks / f"{module.name}.lock", "w") as lock:

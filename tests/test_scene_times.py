@@ -222,7 +222,10 @@ def test_a_stage_in_which_all_moves_has_its_own_frame_at_every_time(tmp_path):
         np.testing.assert_array_equal(value, fresh[name], err_msg=name)
 
 
-@pytest.mark.parametrize("settings", [{}, {"shadows": "off", "refine": "strict"}, {"environment_update": "frame"}])
+@pytest.mark.parametrize(
+    "settings",
+    [{}, {"shadows": "off", "refine": "strict"}, {"environment_update": "frame", "environment_resolution": 64}],
+)
 def test_frames_of_shared_scenes_are_those_of_fresh_ones(path, settings):
     asked = wr.Settings(**settings)
     method = "environment" if "environment_update" in settings else "auto"

@@ -18,7 +18,8 @@ from warp_reflect.transmission_vector import cross_blocks_kernel
 from warp_reflect.waves_vector import wave_blocks_kernel
 
 BLOCKS = [fill_blocks_kernel, reflect_blocks_kernel, refract_blocks_kernel, cross_blocks_kernel, wave_blocks_kernel]
-WAVY = with_finish(WATER, wave_slope=0.06, wave_length=0.7, wave_speed=1.0)
+# So steep that rays reflected in them would go down into the water, were they not turned up again.
+WAVY = with_finish(WATER, wave_slope=0.3, wave_length=0.7, wave_speed=1.0)
 
 
 def clear_things():
