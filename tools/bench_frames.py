@@ -303,11 +303,13 @@ def slopes(stage: str, size: tuple[int, int], arguments) -> list[dict]:
             case("vertices", finer.vertex_count, finer, wr.make_plan(finer, size=size, settings=base, method=method))
         for quantity, points in cases.items():
             spent: list[list[float]] = [[] for _ in points]
+            whole: list[list[float]] = [[] for _ in points]
             for round_ in range(arguments.frames + 1):
                 for k, (_, of_scene, each) in enumerate(points):
                     frame = wr.render_frame(of_scene, each)
                     if round_:
                         spent[k].append(frame.timings.get("reflect", 0.0))
+                        whole[k].append(frame.spent_ms)
             medians = [statistics.median(times) for times in spent]
             rows.append(
                 common(stage, size, scene, arguments)
@@ -317,6 +319,8 @@ def slopes(stage: str, size: tuple[int, int], arguments) -> list[dict]:
                     "quantity": quantity,
                     "amounts": [amount for amount, _, _ in points],
                     "reflect_ms": medians,
+                    "frame_ms": [statistics.median(times) for times in whole],
+                    "least_frame_ms": [min(times) for times in whole],
                     "slope": fitted_slope([amount for amount, _, _ in points], medians),
                 }
             )
@@ -359,6 +363,11 @@ def slope_table(rows: list[dict]) -> None:
             f"{time:.1f} at {amount:,.0f}" for amount, time in zip(row["amounts"], row["reflect_ms"], strict=True)
         )
         print(f"{row['stage']:14s} {row['contender']:14s} {row['quantity']:11s} {slope:>8s}  {points}")
+        if row["quantity"] == "threads":
+            # Others on the machine disturb several threads more than one: the least is nearer to a machine of one's own.
+            frames = zip(row["frame_ms"], row["least_frame_ms"], row["amounts"], strict=True)
+            told = ", ".join(f"{median:.1f} ({least:.1f}) at {amount:.0f}" for median, least, amount in frames)
+            print(f"{'':42s} whole frames, median and least: {told}")
 
 
 def table(rows: list[dict]) -> None:

@@ -1,4 +1,4 @@
-"""Whole frames with every effect on are the same bits by one thread and by two."""
+"""Whole frames with every effect on are the same bits by one thread, by two and by eight."""
 
 from __future__ import annotations
 
@@ -61,10 +61,10 @@ def two_frames(scene: Scene, method: str, threads: int) -> wr.Frame:
     return wr.render_frame(scene, plan, camera=camera, previous=first)
 
 
-@pytest.mark.parametrize("method", TECHNIQUES)
-def test_frames_are_the_same_bits_by_one_thread_and_by_two(rooms, method):
+@pytest.mark.parametrize(("method", "threads"), [*((method, 2) for method in TECHNIQUES), ("reflector_map", 8)])
+def test_frames_are_the_same_bits_by_any_number_of_threads(rooms, method, threads):
     scene = rooms["plane" if method == "planar" else "ball"]
-    one, two = (two_frames(scene, method, threads) for threads in (1, 2))
+    one, two = (two_frames(scene, method, count) for count in (1, threads))
     row = next(row for row in one.plan.rows if row.path == "/mirror")
     assert row.technique == method and row.forced
     effects = {name: effect.on for name, effect in row.effects.items()}
