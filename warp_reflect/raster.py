@@ -323,6 +323,12 @@ def clip(target: TargetView, a: wp.vec4, b: wp.vec4, c: wp.vec4) -> Clipped:
 
 
 @wp.func
+def in_guard(corner: wp.vec3) -> bool:
+    """Whether a corner lies where clipping is to leave it, which rounding may undo where depths are decades apart."""
+    return wp.abs(corner[0]) <= GUARD + 1.0 and wp.abs(corner[1]) <= GUARD + 1.0
+
+
+@wp.func
 def draw_clipped(
     target: TargetView,
     a: wp.vec4,

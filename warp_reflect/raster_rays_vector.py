@@ -9,8 +9,8 @@ full however few pixels a triangle has. Whether a fragment is inside is told by 
 and what it needs of memory has been asked for by then.
 
 Triangles beyond a box of 64 pixels are drawn one at a time in float64, whose 53 bits hold everything below 2^46; within it
-edge functions are exact in 32 bits (products below 2^29, sums of two below 2^30). What has to be clipped goes to the plain
-kernel's functions.
+edge functions are exact in 32 bits (products below 2^29, sums of two below 2^30). What has to be clipped is, by the
+plain kernel's functions, and drawn like those.
 """
 
 from __future__ import annotations
@@ -23,11 +23,15 @@ from warp_reflect.raster import (
     GUARD,
     RAY_ALONG_MIN,
     RAY_TRUST,
+    Clipped,
     PlaneView,
     TargetView,
     at_depth,
-    draw_clipped,
+    clip,
+    draw_triangle,
+    in_guard,
     needs_clipping,
+    screen_corner,
     triangle_plane,
 )
 
@@ -450,21 +454,34 @@ def draw_rays_kernel(
                 a = at_depth(a, middle)
                 b = at_depth(b, middle)
                 c = at_depth(c, middle)
-            if needs_clipping(a) or needs_clipping(b) or needs_clipping(c):
-                draw_clipped(target, a, b, c, plane, triangle, row_first, row_end)
-            else:
-                draw_large(
-                    target,
-                    wp.vec3(a[0], a[1], a[2]),
-                    wp.vec3(b[0], b[1], b[2]),
-                    wp.vec3(c[0], c[1], c[2]),
-                    plane,
-                    triangle,
-                    row_first,
-                    row_end,
-                    RAY_ALONG_MIN,
-                    RAY_TRUST,
-                )
+            clipped = Clipped()
+            clipped.count = 3
+            whole = not (needs_clipping(a) or needs_clipping(b) or needs_clipping(c))
+            if not whole:
+                clipped = clip(target, a, b, c)
+            for k in range(1, clipped.count - 1):
+                p = wp.vec3(a[0], a[1], a[2])
+                q = wp.vec3(b[0], b[1], b[2])
+                r = wp.vec3(c[0], c[1], c[2])
+                if not whole:
+                    p = screen_corner(target, clipped.corners[0])
+                    q = screen_corner(target, clipped.corners[k])
+                    r = screen_corner(target, clipped.corners[k + 1])
+                if in_guard(p) and in_guard(q) and in_guard(r):
+                    draw_large(
+                        target,
+                        p,
+                        q,
+                        r,
+                        plane,
+                        triangle,
+                        row_first,
+                        row_end,
+                        RAY_ALONG_MIN,
+                        RAY_TRUST,
+                    )
+                else:
+                    draw_triangle(target, p, q, r, plane, triangle, row_first, row_end)
         left = left >> wp.uint64(1)
         t += 1
 

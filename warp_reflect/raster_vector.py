@@ -1,10 +1,10 @@
 """`raster.draw_kernel` without rays, with triangles and pixels side by side: the same picture, bit for bit.
 
-Triangles are set up in vectors, and those within a box of 64 pixels are drawn without further ado; larger ones one at a time,
-and what has to be clipped by the plain kernel's functions. Fragments need no memory but their own keys: pixels that lie side by
-side are drawn at once, tile by tile of 64 pixels. A tile remembers what it is covered by, and what lies behind that is not
-drawn (Hasselgren, Andersson and Akenine-Moeller, Masked Software Occlusion Culling, HPG 2016, section 3, with one layer; here
-nothing is lost by it, as the depths themselves are kept too).
+Triangles are set up in vectors, and those within a box of 64 pixels are drawn without further ado; larger ones, and what the
+plain kernel's functions leave of those that have to be clipped, one at a time. Fragments need no memory but their own keys:
+pixels that lie side by side are drawn at once, tile by tile of 64 pixels. A tile remembers what it is covered by, and what
+lies behind that is not drawn (Hasselgren, Andersson and Akenine-Moeller, Masked Software Occlusion Culling, HPG 2016, section
+3, with one layer; here nothing is lost by it, as the depths themselves are kept too).
 
 Edge functions of a triangle within a box of 64 pixels are exact in 32 bits (products below 2^29, sums of two below 2^30, and a
 vector reaches at most 15 pixels past the box); of larger ones in float64, whose 53 bits hold everything below 2^46, or in
@@ -19,11 +19,15 @@ from warp_reflect import vector
 from warp_reflect.layers import CameraView
 from warp_reflect.raster import (
     GUARD,
+    Clipped,
     PlaneView,
     TargetView,
     at_depth,
-    draw_clipped,
+    clip,
+    draw_triangle,
+    in_guard,
     needs_clipping,
+    screen_corner,
 )
 
 wp.set_module_options({"enable_backward": False})
@@ -487,19 +491,32 @@ def draw_blocks_kernel(
                 a = at_depth(a, middle)
                 b = at_depth(b, middle)
                 c = at_depth(c, middle)
-            if needs_clipping(a) or needs_clipping(b) or needs_clipping(c):
-                draw_clipped(target, a, b, c, PlaneView(), triangle, row_first, row_end)
-            else:
-                draw_large(
-                    target,
-                    wp.vec3(a[0], a[1], a[2]),
-                    wp.vec3(b[0], b[1], b[2]),
-                    wp.vec3(c[0], c[1], c[2]),
-                    triangle,
-                    row_first,
-                    row_end,
-                    tiles,
-                )
+            clipped = Clipped()
+            clipped.count = 3
+            whole = not (needs_clipping(a) or needs_clipping(b) or needs_clipping(c))
+            if not whole:
+                clipped = clip(target, a, b, c)
+            for k in range(1, clipped.count - 1):
+                p = wp.vec3(a[0], a[1], a[2])
+                q = wp.vec3(b[0], b[1], b[2])
+                r = wp.vec3(c[0], c[1], c[2])
+                if not whole:
+                    p = screen_corner(target, clipped.corners[0])
+                    q = screen_corner(target, clipped.corners[k])
+                    r = screen_corner(target, clipped.corners[k + 1])
+                if in_guard(p) and in_guard(q) and in_guard(r):
+                    draw_large(
+                        target,
+                        p,
+                        q,
+                        r,
+                        triangle,
+                        row_first,
+                        row_end,
+                        tiles,
+                    )
+                else:
+                    draw_triangle(target, p, q, r, PlaneView(), triangle, row_first, row_end)
         left = left >> wp.uint64(1)
         i += 1
 
