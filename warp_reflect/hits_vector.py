@@ -39,13 +39,9 @@ HITS = r"""
         }
         return det;
     };
-    // Integer fields of patches; neighbouring points mostly share one, which is then read once.
     const auto* patches = scene.patches.data;
     constexpr int patch_words = sizeof(*patches) / 4;
-    auto of_patch = [&](const int* field, I patch) -> I {
-        return !bits(patch != patch[0]) ? I(field[patch_words * patch[0]]) : igather(field, patch_words * patch);
-    };
-    // Their quadrics: rows and shifts of `unit_from_scene`, and a, b, c.
+    // Quadrics of patches: rows and shifts of `unit_from_scene`, and a, b, c.
     struct Quadric { V row[3]; F shift[3], a, b, c; };
     auto quadric_of = [&](I patch) -> Quadric {
         const float* matrix = &patches->unit_from_scene.data[0][0];
@@ -79,7 +75,7 @@ HITS = r"""
     };
     // Triangles of lanes. In memory: addresses are made of their numbers one by one, which takes them out of a vector anew
     // for every array that is read.
-    struct Triangles { int of[LANES]; bool alone; };
+    struct Triangles { int of[LANES]; bool alone, one_patch; };
     auto triangles_of = [&](I tri) -> Triangles {
         Triangles t;
         istore(t.of, tri);
@@ -87,11 +83,19 @@ HITS = r"""
         t.alone = !bits(tri != tri[0]);
         return t;
     };
-    auto patch_of = [&](const Triangles& t) -> I {
+    auto patch_of = [&](Triangles& t) -> I {
         const int* all = scene.triangle_patch.data;
         I patch = I(all[t.of[0]]);
-        if (!t.alone) EACH_LANE patch[l] = all[t.of[l]];
+        t.one_patch = true;
+        if (!t.alone) {
+            EACH_LANE patch[l] = all[t.of[l]];
+            t.one_patch = !bits(patch != patch[0]);
+        }
         return patch;
+    };
+    // Integer fields of their patches; neighbouring points mostly share one, which is then read once.
+    auto of_patch = [&](const int* field, const Triangles& t, I patch) -> I {
+        return t.one_patch ? I(field[patch_words * patch[0]]) : igather(field, patch_words * patch);
     };
     // Values at their corners, by index, where they have any.
     struct Corners { V a, b, c; I has; };

@@ -101,8 +101,8 @@ HITS_SPLIT_MIN = 16  # blocks of rays; those of a few pixels meet triangles all 
         if (bits(seen)) {
             triangles = triangles_of(tri);
             patch = patch_of(triangles);
-            at = looked_up ? look_words * own : material_words * of_patch(&patches->material, patch);
-            const bool alone = !bits(at != at[0]);
+            at = looked_up ? look_words * own : material_words * of_patch(&patches->material, triangles, patch);
+            const bool alone = triangles.one_patch && !looked_up;
             F field[18];
             if (alone) {
                 _Pragma("clang loop unroll(full)") for (int k = 0; k < 18; ++k) field[k] = F(table[at[0] + k]);
@@ -125,7 +125,7 @@ HITS_SPLIT_MIN = 16  # blocks of rays; those of a few pixels meet triangles all 
             }
             // What mirrors as much at any angle, and gives back nothing besides.
             even = (f0.x == f90.x) & (f0.y == f90.y) & (f0.z == f90.z) & ~colored;
-            bare = seen & reflector & even & ~(clearcoat > 0.0f);
+            if (bits(reflector) == bits(I(-1))) bare = seen & even & ~(clearcoat > 0.0f);
         }
 
         V base = same(0.0f), mirror = same(1.0f);
@@ -161,7 +161,7 @@ HITS_SPLIT_MIN = 16  # blocks of rays; those of a few pixels meet triangles all 
                 Corners colors = {};
                 if (bits(seen & colored)) colors = at_corners(triangles, scene.color_index, scene.colors);
                 const I has_color = colored & colors.has;
-                const I quadric = (of_patch(&patches->shape, patch) == 1) & ~smooth.has;
+                const I quadric = (of_patch(&patches->shape, triangles, patch) == 1) & ~smooth.has;
                 F u = F(0.0f), v = F(0.0f);
                 V p = same(0.0f);
                 if (bits(seen & (smooth.has | quadric | has_color)) || areas.shape[0] > 0) {

@@ -54,7 +54,7 @@ FLAT = module_part(__name__, "flat")
         }
         const I tri = ipick(seen, known, I(0));
         const I number = pixel.shape[0] > 0 ? igather(pixel.data, own) : own;
-        const Triangles triangles = triangles_of(tri);
+        Triangles triangles = triangles_of(tri);
         V p0, p1, p2, way;
         F u, v;
         corners(records.data, tri, p0, p1, p2);
@@ -76,7 +76,7 @@ FLAT = module_part(__name__, "flat")
         const V facet = facet_normal(p0, p1, p2);
         const I patch = patch_of(triangles);
         const Corners smooth = normals_of(triangles);
-        const I quadric = (of_patch(&patches->shape, patch) == shape_quadric) & ~smooth.has;
+        const I quadric = (of_patch(&patches->shape, triangles, patch) == shape_quadric) & ~smooth.has;
         Quadric of;
         V q;
         V n = hit_normal(seen, patch, quadric, [&]() -> V { return facet; }, at, u, v, smooth, of, q), p = at;

@@ -45,9 +45,9 @@ LISTED_IDS = 32  # each has a number in every block of pixels
         const Sight of_eye = sight(column + 0.5f, line + 0.5f);
         const V ray = of_eye.ray;
         const I tri = igather(triangle.data, at);
-        const Triangles triangles = triangles_of(tri);
+        Triangles triangles = triangles_of(tri);
         const I patch = patch_of(triangles);
-        const I shape = of_patch(&patches->shape, patch);
+        const I shape = of_patch(&patches->shape, triangles, patch);
         Quadric of;
         if (bits(shape != 0)) of = quadric_of(patch);
         V p, n, incident = unit(ray);
