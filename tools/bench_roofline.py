@@ -41,6 +41,7 @@ import warp as wp
 sys.path.insert(0, str(Path(__file__).parent))
 from bench_frames import commit, machine
 
+from warp_reflect import launch
 from warp_reflect.launch import CPU_BLOCK_DIM
 
 wp.set_module_options({"enable_backward": False})
@@ -245,33 +246,30 @@ def bench(stage: str, arguments: argparse.Namespace, peaks: Peaks) -> list[dict]
     frame = wr.render_frame(scene, plan)
     works: dict[str, Work] = defaultdict(Work)
     spent: Counter = Counter()
-    launch, run_command = wp.launch, wp.Launch.launch
+    pack, run = launch._packed, wp.Launch.launch
 
-    def timed(kernel, dim, inputs=(), device=None, **how):
+    def timed(command, *given):
         start = time.thread_time()
-        command = launch(kernel, dim=dim, inputs=inputs, device=device, **how)
-        spent[kernel.key] += 1000.0 * (time.thread_time() - start)
-        elements[kernel.key] += dim
-        return command
-
-    def timed_command(command, *given):
-        start = time.thread_time()
-        run_command(command, *given)
+        run(command, *given)
         spent[command.kernel.key] += 1000.0 * (time.thread_time() - start)
 
-    def counted(kernel, dim, inputs=(), device=None, **how):
-        work = works[kernel.key]
-        work.elements += dim
-        work.given += given(inputs)
+    def noted(kernel, count, inputs, device):
+        elements[kernel.key] += count
+        return pack(kernel, count, inputs, device)
+
+    def counted(kernel, count, inputs, device):
+        work, asked = works[kernel.key], [0, *inputs]
+        work.elements += count
+        work.given += given(asked)
         if chosen[kernel.key]:
-            steps = max(int(arguments.steps * dim / chosen[kernel.key]), 1)
-            count_instructions(kernel, dim, inputs, steps, work, rng, launch)
-        return launch(kernel, dim=dim, inputs=inputs, device=device, **how)
+            steps = max(int(arguments.steps * count / chosen[kernel.key]), 1)
+            count_instructions(kernel, count, asked, steps, work, rng, wp.launch)
+        return pack(kernel, count, inputs, device)
 
     times: list[Counter] = []
     whole: list[float] = []
     try:
-        wp.launch, wp.Launch.launch = timed, timed_command
+        launch._packed, wp.Launch.launch = noted, timed
         for round_ in range(arguments.rounds + 1):
             spent.clear()
             elements: Counter = Counter()
@@ -284,10 +282,10 @@ def bench(stage: str, arguments: argparse.Namespace, peaks: Peaks) -> list[dict]
         total = statistics.median(whole)
         chosen = Counter({kernel: elements[kernel] for kernel in ms if ms[kernel] >= arguments.share * total})
         rng = np.random.default_rng(1)
-        wp.launch = counted
+        launch._packed = counted
         wr.render_frame(scene, plan, previous=frame)
     finally:
-        wp.launch, wp.Launch.launch = launch, run_command
+        launch._packed, wp.Launch.launch = pack, run
     told = disassembled({address for work in works.values() for address in work.counts})
     rows = []
     for kernel in sorted(chosen, key=lambda kernel: -ms[kernel]):
