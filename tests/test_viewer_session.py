@@ -502,7 +502,8 @@ def test_search_path_descends_to_what_the_pixel_shows(ball_room, search):
         pick = session.pick(int(columns[k]), int(rows[k]))
         path = geometry.meshes(session.plan, session.frame, session.picks)["search path /mirror"]
         residual, used = path.point_data["residual"], path.point_data["evaluations"]
-        assert (np.diff(residual) < 0.0).all() and (np.diff(used) > 0).all() and used[0] == 1
+        # A search may end on texels it has just read: its last step then costs no evaluation.
+        assert (np.diff(residual) < 0.0).all() and (np.diff(used) >= 0).all() and used[0] == 1
         assert residual[-1] < 1e-4
         # It ends at the mirror point that the ray of the pixel found, to the map's accuracy.
         assert np.linalg.norm(path.points[-1] + ball_room.origin - pick.mirror_point) < 2e-3
