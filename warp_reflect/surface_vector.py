@@ -45,9 +45,9 @@ LISTED_IDS = 32  # each has a number in every block of pixels
         const Sight of_eye = sight(column + 0.5f, line + 0.5f);
         const V ray = of_eye.ray;
         const I tri = igather(triangle.data, at);
-        Triangles triangles = triangles_of(tri);
-        const I patch = patch_of(triangles);
-        const I shape = of_patch(&patches->shape, triangles, patch);
+        const I patch = igather(scene.triangle_patch.data, tri);
+        const int* of_shape = &patches->shape;
+        const I shape = !bits(patch != patch[0]) ? I(of_shape[patch_words * patch[0]]) : igather(of_shape, patch_words * patch);
         Quadric of;
         if (bits(shape != 0)) of = quadric_of(patch);
         V p, n, incident = unit(ray);
@@ -82,7 +82,7 @@ LISTED_IDS = 32  # each has a number in every block of pixels
             V at_scene = add(add(times(w, p0), times(u, p1)), times(v, p2));
             const V way = parallel ? incident : unit(add(add(times(w, a), times(u, b)), times(v, c)));
             V turned = facet_normal(a, b, c);
-            const Corners smooth = normals_of(triangles);
+            const Corners smooth = normals_of(triangles_of(tri));
             if (bits(smooth.has)) {
                 const V mixed = between(smooth, u, v);
                 turned = vpick(smooth.has & (dot(mixed, mixed) >= least_normal * least_normal), unit(mixed), turned);
