@@ -113,6 +113,11 @@ def of_plan(plan: Plan) -> list[str]:
     return _of(asked, vector)
 
 
+def of_channels(plan: Plan) -> list[str]:
+    """Those of all data channels of a frame, which are launched after those of the plan."""
+    return ["surface/channels", *(["channels"] if any(row.pixels > 0 for row in plan.rows) else [])]
+
+
 def vectors(settings: Settings, device: wp.DeviceLike) -> bool:
     """Whether vector kernels run where this machine's compiler has them, which is not tried here."""
     return settings.kernels != "plain" and not wp.get_device(device).is_cuda

@@ -120,9 +120,13 @@ class Job:
     @property
     def looks_back(self) -> bool:
         """Whether a frame depends on the one before: through its motion channel, or by reusing what that one found."""
-        data = any(kind == PICTURE and name.lower().endswith(".exr") for name, kind in self.outputs(0))
         asked = self.channels is None or any(name.startswith("reflectionMotion") for name in self.channels)
-        return self.reuses or (data and asked)
+        return self.reuses or (self.has_data and asked)
+
+    @property
+    def has_data(self) -> bool:
+        """Whether data channels are written."""
+        return any(kind == PICTURE and name.lower().endswith(".exr") for name, kind in self.outputs(0))
 
     @property
     def reuses(self) -> bool:
@@ -200,6 +204,8 @@ class OpenJob:
 
     def _draw(self, place: int, previous: wr.Frame | None) -> wr.Frame:
         plan = self.plan_at(place)
+        if previous is None and self.job.has_data and self.job.channels is None:
+            kernels.begin([*kernels.of_plan(plan), *kernels.of_channels(plan)], plan.scene.device)
         return wr.render_frame(plan.scene, plan, previous=previous)
 
 
