@@ -428,6 +428,42 @@ def triangle_plane(points: wp.array(dtype=wp.vec3), corners: wp.vec3i) -> PlaneV
     return plane
 
 
+@wp.struct
+class Survivor:
+    """A triangle that is drawn: its corners, as they are projected, and what the z-buffer stores of it."""
+
+    a: wp.vec4
+    b: wp.vec4
+    c: wp.vec4
+    triangle: int
+
+
+@wp.func
+def survivor(
+    target: TargetView,
+    screen: wp.array(dtype=wp.vec4),
+    triangles: wp.array(dtype=wp.vec3i),
+    ids: wp.array(dtype=int),
+    id_offset: int,
+    t: int,
+) -> Survivor:
+    """Triangle t; at one depth, its middle's, where the target is painted."""
+    corners = triangles[t]
+    found = Survivor()
+    found.a = screen[corners[0]]
+    found.b = screen[corners[1]]
+    found.c = screen[corners[2]]
+    found.triangle = t + id_offset
+    if ids.shape[0] > 0:
+        found.triangle = ids[t]
+    if target.painter != 0:
+        middle = (found.a[2] + found.b[2] + found.c[2]) / 3.0
+        found.a = at_depth(found.a, middle)
+        found.b = at_depth(found.b, middle)
+        found.c = at_depth(found.c, middle)
+    return found
+
+
 @wp.func
 def draw_survivor(
     target: TargetView,
@@ -442,21 +478,14 @@ def draw_survivor(
     row_end: int,
 ):
     """Draw triangle t into rows [row_first, row_end), clipped where it must be."""
-    corners = triangles[t]
-    a = screen[corners[0]]
-    b = screen[corners[1]]
-    c = screen[corners[2]]
-    triangle = t + id_offset
-    if ids.shape[0] > 0:
-        triangle = ids[t]
+    drawn = survivor(target, screen, triangles, ids, id_offset, t)
+    a = drawn.a
+    b = drawn.b
+    c = drawn.c
+    triangle = drawn.triangle
     plane = PlaneView()
     if target.ray.shape[0] > 0:
         plane = triangle_plane(points, plane_triangles[t])
-    if target.painter != 0:
-        middle = (a[2] + b[2] + c[2]) / 3.0
-        a = at_depth(a, middle)
-        b = at_depth(b, middle)
-        c = at_depth(c, middle)
     if needs_clipping(a) or needs_clipping(b) or needs_clipping(c):
         draw_clipped(target, a, b, c, plane, triangle, row_first, row_end)
     else:

@@ -22,12 +22,12 @@ from warp_reflect.raster import (
     Clipped,
     PlaneView,
     TargetView,
-    at_depth,
     clip,
     draw_triangle,
     in_guard,
     needs_clipping,
     screen_corner,
+    survivor,
 )
 
 wp.set_module_options({"enable_backward": False})
@@ -46,8 +46,6 @@ def tile_words(box: tuple[int, int, int, int]) -> int:
 _TARGET = (
     vector.TRIANGLES
     + r"""
-    // raster.edge_bias
-    auto edge_bias = [](I dx, I dy) -> I { return ((dy < 0) | ((dy == 0) & (dx > 0))) ? I(0) : I(-1); };
     const int width = target.x1 - target.x0;
     const bool masked = target.mask_value > 0;
     unsigned long long* keys = (unsigned long long*)target.key.data;
@@ -336,38 +334,9 @@ def draw_block(
 @wp.func_native(
     vector.snippet(
         _TARGET
+        + vector.ONE_TRIANGLE
         + r"""
-    typedef double D __attribute__((ext_vector_type(LANES)));
-    auto lesser = [](int p, int q) -> int { return p < q ? p : q; };
-    auto larger = [](int p, int q) -> int { return p > q ? p : q; };
-    const int xa = snap(F(a[0]))[0], ya = snap(F(a[1]))[0];
-    int xb = snap(F(b[0]))[0], yb = snap(F(b[1]))[0], xc = snap(F(c[0]))[0], yc = snap(F(c[1]))[0];
     const float ka = a[2];
-    float kb = b[2], kc = c[2];
-    long long area = (long long)(xb - xa) * (yc - ya) - (long long)(yb - ya) * (xc - xa);
-    if (area == 0) return;
-    if (area < 0) {
-        area = -area;
-        const int x = xb, y = yb;
-        const float k = kb;
-        xb = xc; yb = yc; kb = kc;
-        xc = x; yc = y; kc = k;
-    }
-    const int low_x = lesser(xa, lesser(xb, xc)), high_x = larger(xa, larger(xb, xc));
-    const int low_y = lesser(ya, lesser(yb, yc)), high_y = larger(ya, larger(yb, yc));
-    const int left = larger((low_x + 127) >> 8, target.x0), right = lesser((high_x - 128) >> 8, target.x1 - 1);
-    const int top = larger((low_y + 127) >> 8, larger(target.y0, row_first));
-    const int bottom = lesser((high_y - 128) >> 8, lesser(target.y1, row_end) - 1);
-    if (left > right || top > bottom) return;
-    const int dxa = xc - xb, dya = yc - yb, dxb = xa - xc, dyb = ya - yc, dxc = xb - xa, dyc = yb - ya;
-    const int px = left * 256 + 128, py = top * 256 + 128;
-    const long long ea0 = (long long)dxa * (py - yb) - (long long)dya * (px - xb);
-    const long long eb0 = (long long)dxb * (py - yc) - (long long)dyb * (px - xc);
-    const long long ec0 = (long long)dxc * (py - ya) - (long long)dyc * (px - xa);
-    const int bias_a = edge_bias(I(dxa), I(dya))[0], bias_b = edge_bias(I(dxb), I(dyb))[0];
-    const int bias_c = edge_bias(I(dxc), I(dyc))[0];
-    const float inv_area = 1.0f / (float)area;
-    const int low = ~triangle;
     const int x_first = left - target.x0, x_last = right - target.x0;
     const int y_first = top - target.y0, y_last = bottom - target.y0;
     // Steps are multiples of 256, so that the sign of an edge function is that of its whole part in those: within a tile
@@ -479,18 +448,11 @@ def draw_blocks_kernel(
     while left != wp.uint64(0):
         if (left & wp.uint64(1)) != wp.uint64(0):
             t = survivors[i]
-            corners = triangles[t]
-            a = screen[corners[0]]
-            b = screen[corners[1]]
-            c = screen[corners[2]]
-            triangle = t + id_offset
-            if ids.shape[0] > 0:
-                triangle = ids[t]
-            if target.painter != 0:
-                middle = (a[2] + b[2] + c[2]) / 3.0
-                a = at_depth(a, middle)
-                b = at_depth(b, middle)
-                c = at_depth(c, middle)
+            drawn = survivor(target, screen, triangles, ids, id_offset, t)
+            a = drawn.a
+            b = drawn.b
+            c = drawn.c
+            triangle = drawn.triangle
             clipped = Clipped()
             clipped.count = 3
             whole = not (needs_clipping(a) or needs_clipping(b) or needs_clipping(c))

@@ -342,7 +342,43 @@ TRIANGLES = r"""
         c.small = (high_x - low_x <= 64 * 256) & (high_y - low_y <= 64 * 256);
         return c;
     };
-    (void)marks; (void)marked; (void)packed; (void)cornered;
+    // raster.edge_bias
+    auto edge_bias = [](I dx, I dy) -> I { return ((dy < 0) | ((dy == 0) & (dx > 0))) ? I(0) : I(-1); };
+    (void)marks; (void)marked; (void)packed; (void)cornered; (void)edge_bias;
+"""
+
+# After those: one triangle of corners a, b, c into rows of a target, as `raster.draw_triangle` sets it up.
+ONE_TRIANGLE = r"""
+    typedef double D __attribute__((ext_vector_type(LANES)));
+    auto lesser = [](int p, int q) -> int { return p < q ? p : q; };
+    auto larger = [](int p, int q) -> int { return p > q ? p : q; };
+    const int xa = snap(F(a[0]))[0], ya = snap(F(a[1]))[0];
+    int xb = snap(F(b[0]))[0], yb = snap(F(b[1]))[0], xc = snap(F(c[0]))[0], yc = snap(F(c[1]))[0];
+    float kb = b[2], kc = c[2];
+    long long area = (long long)(xb - xa) * (yc - ya) - (long long)(yb - ya) * (xc - xa);
+    if (area == 0) return;
+    if (area < 0) {
+        area = -area;
+        const int x = xb, y = yb;
+        const float k = kb;
+        xb = xc; yb = yc; kb = kc;
+        xc = x; yc = y; kc = k;
+    }
+    const int low_x = lesser(xa, lesser(xb, xc)), high_x = larger(xa, larger(xb, xc));
+    const int low_y = lesser(ya, lesser(yb, yc)), high_y = larger(ya, larger(yb, yc));
+    const int left = larger((low_x + 127) >> 8, target.x0), right = lesser((high_x - 128) >> 8, target.x1 - 1);
+    const int top = larger((low_y + 127) >> 8, larger(target.y0, row_first));
+    const int bottom = lesser((high_y - 128) >> 8, lesser(target.y1, row_end) - 1);
+    if (left > right || top > bottom) return;
+    const int dxa = xc - xb, dya = yc - yb, dxb = xa - xc, dyb = ya - yc, dxc = xb - xa, dyc = yb - ya;
+    const int px = left * 256 + 128, py = top * 256 + 128;
+    const long long ea0 = (long long)dxa * (py - yb) - (long long)dya * (px - xb);
+    const long long eb0 = (long long)dxb * (py - yc) - (long long)dyb * (px - xc);
+    const long long ec0 = (long long)dxc * (py - ya) - (long long)dyc * (px - xa);
+    const int bias_a = edge_bias(I(dxa), I(dya))[0], bias_b = edge_bias(I(dxb), I(dyb))[0];
+    const int bias_c = edge_bias(I(dxc), I(dyc))[0];
+    const float inv_area = 1.0f / (float)area;
+    const int low = ~triangle;
 """
 
 
