@@ -631,11 +631,3 @@ def heat_map(comparison: Comparison) -> np.ndarray:
     shifted = comparison.classes == PixelClass.SHIFTED
     image[shifted] = heat_colors(comparison.error_px[shifted])
     return image
-
-
-def wiped(left: np.ndarray, right: np.ndarray, share: float) -> np.ndarray:
-    """The left picture up to a share of the width, the right one (of the same size) from there on."""
-    column = round(np.clip(share, 0.0, 1.0) * left.shape[1])
-    image = left.copy()
-    image[:, column:] = right[:, column:]
-    return image
