@@ -275,7 +275,9 @@ _TARGET = (
             _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each) {
                 int at[LANES];
                 istore(at, 3 * corner[each]);
-                p[each] = threes(point_of, at);
+                F of[4];
+                fours(point_of, at, of);
+                p[each] = V{of[0], of[1], of[2]};
             }
         }
         const V n = cross(sub(p[1], p[0]), sub(p[2], p[0]));

@@ -56,19 +56,12 @@ _TARGET = (
     auto place = [](int l) -> int { return (l & 1) + ((l >> 2) << 1) + ((l & 2) ? LANES / 2 : 0); };
     I places;
     EACH_LANE places[l] = place(l);
-#if defined(__AVX512F__)
-#define FRONT 0, 16, 1, 17, 4, 20, 5, 21, 8, 24, 9, 25, 12, 28, 13, 29
-#define BACK 2, 18, 3, 19, 6, 22, 7, 23, 10, 26, 11, 27, 14, 30, 15, 31
-#else
-#define FRONT 0, 8, 1, 9, 4, 12, 5, 13
-#define BACK 2, 10, 3, 11, 6, 14, 7, 15
-#endif
     typedef long long Keys __attribute__((ext_vector_type(LANES / 2)));
     constexpr unsigned ALL = (1u << LANES) - 1;
     // The larger keys, which order like whole numbers with a sign, of those at `at` and of halves that are 0 where there is none.
     auto put = [&](unsigned long long* at, I low, I high) {
-        const Keys drawn[2] = {__builtin_bit_cast(Keys, __builtin_shufflevector(low, high, FRONT)),
-            __builtin_bit_cast(Keys, __builtin_shufflevector(low, high, BACK))};
+        const Keys drawn[2] = {__builtin_bit_cast(Keys, first_words(low, high)),
+            __builtin_bit_cast(Keys, last_words(low, high))};
         Keys now[2];
         __builtin_memcpy(now, at, sizeof(now));
         const decltype(now[0] > now[0]) newer[2] = {drawn[0] > now[0], drawn[1] > now[1]};

@@ -113,15 +113,64 @@ _HEAD = r"""
         high = __builtin_shufflevector(a, b, 1, 3, 5, 7, 9, 11, 13, 15);
 #endif
     };
-    // Eight floats at p[start[l]] of every lane, as eight vectors. Halves of rows are read into place, so that what is left to
-    // transpose crosses no half of a vector.
+    // Words of two vectors in turn, within blocks of 128 bits, which no shuffle here crosses where it need not: the first or
+    // last two words of each block, or its first or last pair.
+    typedef float Four __attribute__((ext_vector_type(4)));
     typedef float Row __attribute__((ext_vector_type(8)));
-    typedef float HalfRow __attribute__((ext_vector_type(4)));
+#if defined(__AVX512F__)
+    auto first_words = [](auto a, auto b) -> decltype(a) {
+        return __builtin_shufflevector(a, b, 0, 16, 1, 17, 4, 20, 5, 21, 8, 24, 9, 25, 12, 28, 13, 29);
+    };
+    auto last_words = [](auto a, auto b) -> decltype(a) {
+        return __builtin_shufflevector(a, b, 2, 18, 3, 19, 6, 22, 7, 23, 10, 26, 11, 27, 14, 30, 15, 31);
+    };
+    auto first_pairs = [](F a, F b) -> F {
+        return __builtin_shufflevector(a, b, 0, 1, 16, 17, 4, 5, 20, 21, 8, 9, 24, 25, 12, 13, 28, 29);
+    };
+    auto last_pairs = [](F a, F b) -> F {
+        return __builtin_shufflevector(a, b, 2, 3, 18, 19, 6, 7, 22, 23, 10, 11, 26, 27, 14, 15, 30, 31);
+    };
+    auto joined = [](const Four* r) -> F {
+        const Row low = __builtin_shufflevector(r[0], r[1], 0, 1, 2, 3, 4, 5, 6, 7);
+        const Row high = __builtin_shufflevector(r[2], r[3], 0, 1, 2, 3, 4, 5, 6, 7);
+        return __builtin_shufflevector(low, high, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+    };
+#else
+    auto first_words = [](auto a, auto b) -> decltype(a) { return __builtin_shufflevector(a, b, 0, 8, 1, 9, 4, 12, 5, 13); };
+    auto last_words = [](auto a, auto b) -> decltype(a) { return __builtin_shufflevector(a, b, 2, 10, 3, 11, 6, 14, 7, 15); };
+    auto first_pairs = [](F a, F b) -> F { return __builtin_shufflevector(a, b, 0, 1, 8, 9, 4, 5, 12, 13); };
+    auto last_pairs = [](F a, F b) -> F { return __builtin_shufflevector(a, b, 2, 3, 10, 11, 6, 7, 14, 15); };
+    auto joined = [](const Four* r) -> F { return __builtin_shufflevector(r[0], r[1], 0, 1, 2, 3, 4, 5, 6, 7); };
+#endif
+    // Four floats at p[start[l]] of every lane, as four vectors. They are read into place.
+    auto fours = [joined, first_words, last_words, first_pairs, last_pairs](const float* p, const int* start, F* out) {
+        F r[4];
+        _Pragma("clang loop unroll(full)") for (int k = 0; k < 4; ++k) {
+            Four part[LANES / 4];
+            _Pragma("clang loop unroll(full)") for (int l = 0; l < LANES / 4; ++l)
+                __builtin_memcpy(&part[l], p + start[4 * l + k], sizeof(Four));
+            r[k] = joined(part);
+        }
+        const F s = first_words(r[0], r[1]), t = first_words(r[2], r[3]);
+        const F u = last_words(r[0], r[1]), v = last_words(r[2], r[3]);
+        out[0] = first_pairs(s, t);
+        out[1] = last_pairs(s, t);
+        out[2] = first_pairs(u, v);
+        out[3] = last_pairs(u, v);
+    };
+    // Row floats.
+    auto gather8 = [fours](const float* p, I start, F* out) {
+        int at[LANES];
+        __builtin_memcpy(at, &start, sizeof(at));
+        fours(p, at, out);
+        fours(p + 4, at, out + 4);
+    };
+    // Eight rows of eight floats each, at p[start[k]], as columns.
     auto transposed = [](const float* p, const int* start, Row* out) {
         _Pragma("clang loop unroll(full)") for (int half = 0; half < 8; half += 4) {
             Row r[4];
             _Pragma("clang loop unroll(full)") for (int k = 0; k < 4; ++k) {
-                HalfRow a, b;
+                Four a, b;
                 __builtin_memcpy(&a, p + start[k] + half, sizeof(a));
                 __builtin_memcpy(&b, p + start[k + 4] + half, sizeof(b));
                 r[k] = __builtin_shufflevector(a, b, 0, 1, 2, 3, 4, 5, 6, 7);
@@ -136,19 +185,6 @@ _HEAD = r"""
             out[half + 3] = __builtin_shufflevector(u, v, 2, 3, 10, 11, 6, 7, 14, 15);
         }
     };
-    auto gather8 = [transposed](const float* p, I start, F* out) {
-        int at[LANES];
-        __builtin_memcpy(at, &start, sizeof(at));
-        Row rows[LANES];
-        transposed(p, at, rows);
-#if defined(__AVX512F__)
-        transposed(p, at + 8, rows + 8);
-        _Pragma("clang loop unroll(full)") for (int k = 0; k < 8; ++k)
-            out[k] = __builtin_shufflevector(rows[k], rows[k + 8], 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
-#else
-        _Pragma("clang loop unroll(full)") for (int k = 0; k < 8; ++k) out[k] = rows[k];
-#endif
-    };
     auto vgather = [](const float* p, I index) -> V {
         V v;
         EACH_LANE {
@@ -158,14 +194,20 @@ _HEAD = r"""
         return v;
     };
     // Elements start .. start + LANES - 1 of an array of three floats each: rows are read and turned; and back.
-    auto vload = [vgather, lanes](const float* p, int start) -> V {
-#if defined(__AVX512F__)
-        return vgather(p, start + lanes());
-#else
+    auto vload = [](const float* p, int start) -> V {
         F a, b, c;
         __builtin_memcpy(&a, p + 3 * start, sizeof(a));
-        __builtin_memcpy(&b, p + 3 * start + 8, sizeof(b));
-        __builtin_memcpy(&c, p + 3 * start + 16, sizeof(c));
+        __builtin_memcpy(&b, p + 3 * start + LANES, sizeof(b));
+        __builtin_memcpy(&c, p + 3 * start + 2 * LANES, sizeof(c));
+#if defined(__AVX512F__)
+        const F x = __builtin_shufflevector(a, b, 0, 3, 6, 9, 12, 15, 18, 21, 24, 27, 30, -1, -1, -1, -1, -1);
+        const F y = __builtin_shufflevector(a, b, 1, 4, 7, 10, 13, 16, 19, 22, 25, 28, 31, -1, -1, -1, -1, -1);
+        const F z = __builtin_shufflevector(a, b, 2, 5, 8, 11, 14, 17, 20, 23, 26, 29, -1, -1, -1, -1, -1, -1);
+        return V{
+            __builtin_shufflevector(x, c, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 17, 20, 23, 26, 29),
+            __builtin_shufflevector(y, c, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 18, 21, 24, 27, 30),
+            __builtin_shufflevector(z, c, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 16, 19, 22, 25, 28, 31)};
+#else
         return V{
             __builtin_shufflevector(__builtin_shufflevector(a, b, 0, 3, 6, 9, 12, 15, -1, -1), c, 0, 1, 2, 3, 4, 5, 10, 13),
             __builtin_shufflevector(__builtin_shufflevector(a, b, 1, 4, 7, 10, 13, -1, -1, -1), c, 0, 1, 2, 3, 4, 8, 11, 14),
@@ -174,7 +216,15 @@ _HEAD = r"""
     };
     auto vstore = [](float* p, int start, V v) {
 #if defined(__AVX512F__)
-        EACH_LANE { float* q = p + 3 * (start + l); q[0] = v.x[l]; q[1] = v.y[l]; q[2] = v.z[l]; }
+        const F a = __builtin_shufflevector(
+            __builtin_shufflevector(v.x, v.y, 0, 16, -1, 1, 17, -1, 2, 18, -1, 3, 19, -1, 4, 20, -1, 5), v.z,
+            0, 1, 16, 3, 4, 17, 6, 7, 18, 9, 10, 19, 12, 13, 20, 15);
+        const F b = __builtin_shufflevector(
+            __builtin_shufflevector(v.x, v.y, 21, -1, 6, 22, -1, 7, 23, -1, 8, 24, -1, 9, 25, -1, 10, 26), v.z,
+            0, 21, 2, 3, 22, 5, 6, 23, 8, 9, 24, 11, 12, 25, 14, 15);
+        const F c = __builtin_shufflevector(
+            __builtin_shufflevector(v.x, v.y, -1, 11, 27, -1, 12, 28, -1, 13, 29, -1, 14, 30, -1, 15, 31, -1), v.z,
+            26, 1, 2, 27, 4, 5, 28, 7, 8, 29, 10, 11, 30, 13, 14, 31);
 #else
         const F a = __builtin_shufflevector(
             __builtin_shufflevector(v.x, v.y, 0, 8, -1, 1, 9, -1, 2, 10), v.z, 0, 1, 8, 3, 4, 9, 6, 7);
@@ -182,30 +232,37 @@ _HEAD = r"""
             __builtin_shufflevector(v.x, v.y, -1, 3, 11, -1, 4, 12, -1, 5), v.z, 10, 1, 2, 11, 4, 5, 12, 7);
         const F c = __builtin_shufflevector(
             __builtin_shufflevector(v.x, v.y, 13, -1, 6, 14, -1, 7, 15, -1), v.z, 0, 13, 2, 3, 14, 5, 6, 15);
-        __builtin_memcpy(p + 3 * start, &a, sizeof(a));
-        __builtin_memcpy(p + 3 * start + 8, &b, sizeof(b));
-        __builtin_memcpy(p + 3 * start + 16, &c, sizeof(c));
 #endif
+        __builtin_memcpy(p + 3 * start, &a, sizeof(a));
+        __builtin_memcpy(p + 3 * start + LANES, &b, sizeof(b));
+        __builtin_memcpy(p + 3 * start + 2 * LANES, &c, sizeof(c));
     };
     // Four floats an element, of which v has the first three.
-    auto vstore4 = [](float* p, int start, V v, F w) {
+    auto vstore4 = [first_words, last_words, first_pairs, last_pairs](float* p, int start, V v, F w) {
+        const F xy = first_words(v.x, v.y), XY = last_words(v.x, v.y), zw = first_words(v.z, w), ZW = last_words(v.z, w);
+        // Elements 0, 4, .., and 1, 5, .., and so on.
+        const F a = first_pairs(xy, zw), b = last_pairs(xy, zw), c = first_pairs(XY, ZW), d = last_pairs(XY, ZW);
 #if defined(__AVX512F__)
-        EACH_LANE { float* q = p + 4 * (start + l); q[0] = v.x[l]; q[1] = v.y[l]; q[2] = v.z[l]; q[3] = w[l]; }
+        auto first_blocks = [](F a, F b) -> F {
+            return __builtin_shufflevector(a, b, 0, 1, 2, 3, 16, 17, 18, 19, 8, 9, 10, 11, 24, 25, 26, 27);
+        };
+        auto last_blocks = [](F a, F b) -> F {
+            return __builtin_shufflevector(a, b, 4, 5, 6, 7, 20, 21, 22, 23, 12, 13, 14, 15, 28, 29, 30, 31);
+        };
+        auto first_half = [](F a, F b) -> F {
+            return __builtin_shufflevector(a, b, 0, 1, 2, 3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 22, 23);
+        };
+        auto last_half = [](F a, F b) -> F {
+            return __builtin_shufflevector(a, b, 8, 9, 10, 11, 12, 13, 14, 15, 24, 25, 26, 27, 28, 29, 30, 31);
+        };
+        const F ab = first_blocks(a, b), cd = first_blocks(c, d), AB = last_blocks(a, b), CD = last_blocks(c, d);
+        const F rows[4] = {first_half(ab, cd), first_half(AB, CD), last_half(ab, cd), last_half(AB, CD)};
 #else
-        const F xy = __builtin_shufflevector(v.x, v.y, 0, 8, 1, 9, 4, 12, 5, 13);
-        const F XY = __builtin_shufflevector(v.x, v.y, 2, 10, 3, 11, 6, 14, 7, 15);
-        const F zw = __builtin_shufflevector(v.z, w, 0, 8, 1, 9, 4, 12, 5, 13);
-        const F ZW = __builtin_shufflevector(v.z, w, 2, 10, 3, 11, 6, 14, 7, 15);
-        // Elements 0 and 4, 1 and 5, 2 and 6, 3 and 7.
-        const F a = __builtin_shufflevector(xy, zw, 0, 1, 8, 9, 4, 5, 12, 13);
-        const F b = __builtin_shufflevector(xy, zw, 2, 3, 10, 11, 6, 7, 14, 15);
-        const F c = __builtin_shufflevector(XY, ZW, 0, 1, 8, 9, 4, 5, 12, 13);
-        const F d = __builtin_shufflevector(XY, ZW, 2, 3, 10, 11, 6, 7, 14, 15);
         const F rows[4] = {
             __builtin_shufflevector(a, b, 0, 1, 2, 3, 8, 9, 10, 11), __builtin_shufflevector(c, d, 0, 1, 2, 3, 8, 9, 10, 11),
             __builtin_shufflevector(a, b, 4, 5, 6, 7, 12, 13, 14, 15), __builtin_shufflevector(c, d, 4, 5, 6, 7, 12, 13, 14, 15)};
-        __builtin_memcpy(p + 4 * start, rows, sizeof(rows));
 #endif
+        __builtin_memcpy(p + 4 * start, rows, sizeof(rows));
     };
     // The same of what may end before: then the lanes' own numbers count.
     auto vrows = [vload, vgather](const float* p, int start, bool full, I own) -> V {
@@ -218,7 +275,7 @@ _HEAD = r"""
         return full ? iload(p + start) : igather(p, own);
     };
     // Corners of triangles, from `Scene.triangle_records`. Neighbours in a picture often lie on the same.
-    auto corners = [gather8, bits](const float* records, I triangle, V& p0, V& p1, V& p2) {
+    auto corners = [fours, bits](const float* records, I triangle, V& p0, V& p1, V& p2) {
         if (!bits(triangle != triangle[0])) {
             const float* p = records + 12 * triangle[0];
             p0 = V{F(p[0]), F(p[1]), F(p[2])};
@@ -226,18 +283,19 @@ _HEAD = r"""
             p2 = V{F(p[6]), F(p[7]), F(p[8])};
             return;
         }
-        F corner[8], corner_z;
-        const I at = 12 * triangle;
-        gather8(records, at, corner);
-        EACH_LANE corner_z[l] = records[at[l] + 8];
+        F corner[12];
+        int at[LANES];
+        const I start = 12 * triangle;
+        __builtin_memcpy(at, &start, sizeof(at));
+        _Pragma("clang loop unroll(full)") for (int k = 0; k < 12; k += 4) fours(records + k, at, corner + k);
         p0 = V{corner[0], corner[1], corner[2]};
         p1 = V{corner[3], corner[4], corner[5]};
-        p2 = V{corner[6], corner[7], corner_z};
+        p2 = V{corner[6], corner[7], corner[8]};
     };
     (void)bits; (void)lanes; (void)pick; (void)ipick; (void)fmin; (void)fmax; (void)sub; (void)add; (void)dot; (void)cross;
-    (void)load; (void)iload; (void)store; (void)istore; (void)gather; (void)igather; (void)vgather; (void)halves; (void)gather8;
-    (void)product; (void)vpick; (void)same; (void)grey; (void)spread; (void)clip; (void)unit; (void)corners; (void)facet_normal;
-    (void)vload; (void)vstore; (void)vstore4; (void)vrows; (void)frow; (void)irow;
+    (void)load; (void)iload; (void)store; (void)istore; (void)gather; (void)igather; (void)vgather; (void)halves; (void)fours;
+    (void)gather8; (void)product; (void)vpick; (void)same; (void)grey; (void)spread; (void)clip; (void)unit; (void)corners;
+    (void)facet_normal; (void)vload; (void)vstore; (void)vstore4; (void)vrows; (void)frow; (void)irow; (void)transposed;
 """
 
 # Beside it, for the rasteriser's snippets: rows of triangles.
@@ -254,30 +312,6 @@ TRIANGLES = r"""
     auto least = [](I p, I q) -> I { return p < q ? p : q; };
     auto most = [](I p, I q) -> I { return p > q ? p : q; };
     auto snap = [](F x) -> I { return __builtin_convertvector(__builtin_elementwise_floor(x * 256.0f + 0.5f), I); };
-    // The first three of four floats at p[start[l]].
-    auto threes = [](const float* p, const int* start) -> V {
-        typedef float Four __attribute__((ext_vector_type(4)));
-        V v;
-        _Pragma("clang loop unroll(full)") for (int part = 0; part < LANES; part += 8) {
-            Four r[8];
-            Row s[4];
-            _Pragma("clang loop unroll(full)") for (int l = 0; l < 8; ++l)
-                __builtin_memcpy(&r[l], p + start[part + l], sizeof(Four));
-            _Pragma("clang loop unroll(full)") for (int l = 0; l < 4; ++l)
-                s[l] = __builtin_shufflevector(r[l], r[l + 4], 0, 1, 2, 3, 4, 5, 6, 7);
-            const Row xy = __builtin_shufflevector(s[0], s[1], 0, 1, 8, 9, 4, 5, 12, 13);
-            const Row XY = __builtin_shufflevector(s[2], s[3], 0, 1, 8, 9, 4, 5, 12, 13);
-            const Row zw = __builtin_shufflevector(s[0], s[1], 2, 3, 10, 11, 6, 7, 14, 15);
-            const Row ZW = __builtin_shufflevector(s[2], s[3], 2, 3, 10, 11, 6, 7, 14, 15);
-            const Row x = __builtin_shufflevector(xy, XY, 0, 2, 8, 10, 4, 6, 12, 14);
-            const Row y = __builtin_shufflevector(xy, XY, 1, 3, 9, 11, 5, 7, 13, 15);
-            const Row z = __builtin_shufflevector(zw, ZW, 0, 2, 8, 10, 4, 6, 12, 14);
-            __builtin_memcpy((float*)&v.x + part, &x, sizeof(Row));
-            __builtin_memcpy((float*)&v.y + part, &y, sizeof(Row));
-            __builtin_memcpy((float*)&v.z + part, &z, sizeof(Row));
-        }
-        return v;
-    };
     // Puts the words of the lanes that are marked one after the other; up to LANES words at `to` are written.
     auto packed = [](int* to, I words, unsigned marked) -> int {
 #if defined(__AVX2__)
@@ -289,15 +323,15 @@ TRIANGLES = r"""
                     if (mask >> l & 1) made.of[mask] |= (unsigned long long)l << 8 * n++;
             return made;
         }();
-        typedef int Eight __attribute__((ext_vector_type(8)));
+        typedef int Words __attribute__((ext_vector_type(8)));
         typedef unsigned char Bytes __attribute__((ext_vector_type(8)));
         int count = 0;
         _Pragma("clang loop unroll(full)") for (int part = 0; part < LANES; part += 8) {
             const unsigned own = marked >> part & 255;
-            Eight eight;
+            Words eight;
             __builtin_memcpy(&eight, (const int*)&words + part, sizeof(eight));
             eight = __builtin_ia32_permvarsi256(eight,
-                __builtin_convertvector(__builtin_bit_cast(Bytes, order.of[own]), Eight));
+                __builtin_convertvector(__builtin_bit_cast(Bytes, order.of[own]), Words));
             __builtin_memcpy(to + count, &eight, sizeof(eight));
             count += __builtin_popcount(own);
         }
@@ -317,7 +351,9 @@ TRIANGLES = r"""
         _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each) {
             int at[LANES];
             EACH_LANE at[l] = 4 * corners[stride * l + each];
-            c.v[each] = threes(screen, at);
+            F of[4];
+            fours(screen, at, of);
+            c.v[each] = V{of[0], of[1], of[2]};
         }
         F reach = F(0.0f);
         _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each)
