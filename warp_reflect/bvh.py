@@ -275,6 +275,12 @@ class Tracer:
         """Handle for the snippets of `wide_packets.py`, 0 as `id` is; on the CPU only."""
         return 0 if self._tree is None else self._tree.to(self._view.points).packets
 
+    def own_branches(self, body: OwnBody) -> wp.array:
+        """What packets of rays that leave a body pass by (`bvh_vector.first_met`): its branches if it is convex, else none."""
+        if self._tree is None or not body.convex or body.alone:
+            return compact.none(wp.uint8, self._device)
+        return self._tree.wide.branches_of(body.first_triangle, body.triangle_count)
+
     def pays(self, count: int) -> bool:
         """Whether packets of so many rays are worth it: of a scene that moves their tree is fitted again at every time."""
         return not self._shared or count >= RAYS_A_TRIANGLE * (len(self._tree.mesh.indices) // 3)
@@ -441,6 +447,7 @@ def _first_met(
     outputs = [layer.triangle, layer.u, layer.v, layer.distance, layer.status]
     start = [
         *start,
+        tracer.own_branches(start[2]),
         scene.view.triangle_patch,
         compact.none(wp.uint8, scene.device) if inside is None else inside,
     ]

@@ -1,7 +1,8 @@
 """What rays meet first, for a block of them at a time: `ray_walk.trace_ray` in packets, bit for bit.
 
 Neighbouring rays stay together for most of the way (`wide_packets.py`). The few rays that meet their own facet or body first
-are left to `bvh`, with what they met.
+are left to `bvh`, with what they met. A convex body is not there for rays that leave it steeply: a tree's branches near a
+ray's start cost as much as any, and what a ray met of its own body it would step over.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ UNASKED = -2  # a triangle: nothing is known of what the ray meets
 # Pixels of a packet's part of the picture: as many as share most of a walk down the tree; a nearly square part meets few boxes.
 TILE_WIDTH, TILE_HEIGHT = 8, 4
 STRIP = 64  # pixels along a task's row of tiles
+# Cosine to the normal of a convex body below which a ray may still meet it: a normal between corners is not that of the facet.
+GRAZING = 1.0 / 16.0
 JOINED = 16  # rays; tiles with fewer are joined with the next ones, as most of a walk costs the same for any number
 
 
@@ -30,6 +33,7 @@ _CONSTANTS = f"""
     constexpr int NONE = {int(Status.NONE)}, CONVERGED = {int(Status.CONVERGED)}, SKY = {int(Status.SKY)};
     constexpr int LEFT = {LEFT}, MISSED = {MISSED}, UNASKED = {UNASKED};
     constexpr int TILE_WIDTH = {TILE_WIDTH}, TILE_HEIGHT = {TILE_HEIGHT}, STRIP = {STRIP}, JOINED = {JOINED};
+    constexpr float GRAZING = {GRAZING}f;
 """
 
 
@@ -190,6 +194,7 @@ _CONSTANTS = f"""
         I live[GROUPS], own[GROUPS], moved[GROUPS], missed[GROUPS];
         F reach[GROUPS];
         Met met[GROUPS];
+        I grazing = I(0);
         for (int g = 0; g < GROUPS; ++g) {
             live[g] = g * LANES + lanes() < taken;
             own[g] = own_of(g);
@@ -198,12 +203,15 @@ _CONSTANTS = f"""
             // ray_walk.ray_offset
             const F offset = 16.0f * 1.1920929e-7f * (__builtin_elementwise_abs(from[g].x)
                 + __builtin_elementwise_abs(from[g].y) + __builtin_elementwise_abs(from[g].z));
-            o[g] = add(from[g], times(offset, rows(normals, own[g])));
+            const V upright = rows(normals, own[g]);
+            o[g] = add(from[g], times(offset, upright));
+            grazing |= live[g] & (dot(upright, along[g]) < GRAZING);
             d[g] = flushed(along[g]);
             reach[g] = F(3.0e38f);
             moved[g] = I(0);
             missed[g] = live[g];
         }
+        left_out = own_branches.shape[0] > 0 && !bits(grazing) ? own_branches.data : 0;
         for (int round = 0; round < 2; ++round) {
             Met found[GROUPS];
             traverse(Nearest{}, Tile{taken <= LANES}, missed, o, d, reach, found);
@@ -307,6 +315,7 @@ def first_met_block(
     pixel: wp.array(dtype=int),
     body: OwnBody,
     bodies: wp.array(dtype=OwnBody),
+    own_branches: wp.array(dtype=wp.uint8),
     patches: wp.array(dtype=int),
     inside: wp.array(dtype=wp.uint8),
     index: wp.array(dtype=int),
@@ -338,6 +347,7 @@ def first_met_blocks_kernel(
     pixel: wp.array(dtype=int),
     body: OwnBody,
     bodies: wp.array(dtype=OwnBody),
+    own_branches: wp.array(dtype=wp.uint8),
     patches: wp.array(dtype=int),
     inside: wp.array(dtype=wp.uint8),
     # Which are asked:
@@ -368,6 +378,7 @@ def first_met_blocks_kernel(
         pixel,
         body,
         bodies,
+        own_branches,
         patches,
         inside,
         index,
@@ -404,7 +415,8 @@ def first_met(
         records: `Scene.triangle_records`.
         rays: vec3 each: points, normals on the rays' side, unit directions.
         start: Where they start: facets; int32, where among these that of each ray is, none: in order; the body of all of
-            them; bodies of patches, none: that body; the patches of triangles; uint8, where rays have gone through a
+            them; bodies of patches, none: that body; the branches of the tree that are that body's (`WideTree.branches_of`) if
+            it is convex, none: it is met like anything else; the patches of triangles; uint8, where rays have gone through a
             surface: 1 where they are in its body (`ray_walk.trace_onward`), none: they are reflected.
         index: int32, which of the rays; None: all.
         numbers: int32, the pixels of rays.

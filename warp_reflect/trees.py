@@ -55,11 +55,16 @@ class Tree:
     @property
     def packets(self) -> int:
         """Handle for the snippets of `wide_packets.py`; on the CPU only, laid out at first use."""
+        return self.wide.id
+
+    @property
+    def wide(self) -> WideTree:
+        """The structure that packets walk down; as `packets`."""
         if self._wide is None:
             from warp_reflect.wide_tree import WideTree  # not compiled where there are no packets
 
             self._wide = WideTree(self.mesh)
-        return self._wide.id
+        return self._wide
 
 
 def resting_tree(scene: Scene, indices: wp.array) -> Tree:

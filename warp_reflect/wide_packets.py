@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from warp_reflect.packets import RAYS
 
-# After `vector.snippet`'s head. Needs: `mesh_id`, the handle of a `WideTree`.
+# After `vector.snippet`'s head. Needs: `mesh_id`, the handle of a `WideTree`. May set: `left_out`.
 TRAVERSAL = (
     RAYS
     + r"""
@@ -32,6 +32,23 @@ TRAVERSAL = (
     struct Chunk { enum { value = 4 }; };
     typedef int FourMask __attribute__((ext_vector_type(4)));
     const wp::Mesh& tree_mesh = *(const wp::Mesh*)tree[0];
+    // Branches that are passed by: `WideTree.branches_of`, or none.
+    const unsigned char* left_out = 0;
+    // The least or the most of a vector, half by half: the compiler's own reduction minds NaN, one lane after the other.
+    auto folded = [](F v, auto better) -> float {
+#if defined(__AVX512F__)
+        const Row eight = better(__builtin_shufflevector(v, v, 0, 1, 2, 3, 4, 5, 6, 7),
+            __builtin_shufflevector(v, v, 8, 9, 10, 11, 12, 13, 14, 15));
+#else
+        const Row eight = v;
+#endif
+        const Four four = better(__builtin_shufflevector(eight, eight, 0, 1, 2, 3),
+            __builtin_shufflevector(eight, eight, 4, 5, 6, 7));
+        const Four two = better(four, __builtin_shufflevector(four, four, 2, 3, 0, 1));
+        return better(two, __builtin_shufflevector(two, two, 1, 0, 3, 2))[0];
+    };
+    auto lesser = [](auto a, auto b) { return a < b ? a : b; };
+    auto larger = [](auto a, auto b) { return a > b ? a : b; };
     // GROUPS vectors of rays from `o` along `d`, lanes `live` of them, which meet what is nearer than `reach`. `nearest`: the
     // first of it; otherwise a lane is done with the first thing found, and only whether there is one is told (`face`).
     auto traverse = [&](auto nearest, auto groups, const I* live, const V* o, const V* d, const F* reach, Met* met) {
@@ -78,12 +95,12 @@ TRAVERSAL = (
             auto least = [&](auto of) -> float {
                 F v = F(3.0e38f);
                 EACH_GROUP v = fmin(pick(mask[g], of(g), F(3.0e38f)), v);
-                return __builtin_reduce_min(v);
+                return folded(v, lesser);
             };
             auto most = [&](auto of) -> float {
                 F v = F(-3.0e38f);
                 EACH_GROUP v = fmax(pick(mask[g], of(g), F(-3.0e38f)), v);
-                return __builtin_reduce_max(v);
+                return folded(v, larger);
             };
             const auto& root_low = tree_mesh.bvh.node_lowers[*tree_mesh.bvh.root];
             const auto& root_high = tree_mesh.bvh.node_uppers[*tree_mesh.bvh.root];
@@ -147,6 +164,7 @@ TRAVERSAL = (
                 meets(by_z, row(down_z ? 40 : 16), row(down_z ? 16 : 40), enter, leave);
                 const RowMask passed = (leave >= enter) & (enter < far);
                 unsigned found = __builtin_bit_cast(unsigned char, __builtin_convertvector(passed < 0, RowBits));
+                if (left_out) found &= ~left_out[node];
                 float entered[8];
                 __builtin_memcpy(entered, &enter, sizeof(entered));
                 const int from = waiting_count;

@@ -171,6 +171,49 @@ def fit_kernel(
     fit_element(first + wp.tid(), mesh_id, children, sources, faces, out_nodes, out_chunks)
 
 
+@wp.func_native(
+    vector.snippet(r"""
+    // A node's children come after it.
+    for (int node = children.shape[0] / 8 - 1; node >= 0; --node) {
+        int whole = 0;
+        for (int k = 0; k < 8; ++k) {
+            const int child = children.data[8 * node + k];
+            bool all = child <= 0 || out_branches.data[child] == 255;
+            for (int chunk = ~child; child < 0; ++chunk) {
+                for (int l = 0; l < 4; ++l) {
+                    const int face = faces.data[8 * chunk + l];
+                    all &= face < 0 || (face >= first_face && face < end_face);
+                }
+                if (!faces.data[8 * chunk + 4]) break;
+            }
+            whole |= all << k;
+        }
+        out_branches.data[node] = (unsigned char)whole;
+    }
+""")
+)
+def mark_branches(
+    first_face: int,
+    end_face: int,
+    children: wp.array(dtype=int),
+    faces: wp.array(dtype=int),
+    out_branches: wp.array(dtype=wp.uint8),
+): ...
+
+
+@wp.kernel
+def mark_branches_kernel(
+    first: int,
+    first_face: int,
+    end_face: int,
+    children: wp.array(dtype=int),
+    faces: wp.array(dtype=int),
+    out_branches: wp.array(dtype=wp.uint8),
+):
+    """One thread."""
+    mark_branches(first_face, end_face, children, faces, out_branches)
+
+
 def _lines(count: int) -> wp.array:
     """Numbers that begin with a cache line."""
     words = LINE // 4
@@ -198,8 +241,17 @@ class WideTree:
         self._nodes, self._chunks = _lines(NODE_WORDS * nodes), _lines(CHUNK_WORDS * chunks)
         self._elements = nodes + chunks
         self._header = wp.array([mesh.id, self._nodes.ptr, self._chunks.ptr], dtype=wp.uint64, device="cpu")
+        self._branches: dict[tuple[int, int], wp.array] = {}
         self.id = self._header.ptr
         self.fit(threads)
+
+    def branches_of(self, first: int, count: int) -> wp.array:
+        """uint8 of each node, a bit for each child with no other triangles below it than `count` from `first` on."""
+        if (first, count) not in self._branches:
+            made = wp.empty(len(self._children) // WIDTH, dtype=wp.uint8, device="cpu")
+            launch(mark_branches_kernel, 1, [first, first + count, self._children, self._faces, made], "cpu", 1)
+            self._branches[first, count] = made
+        return self._branches[first, count]
 
     def fit(self, threads: int = 0) -> None:
         """Take over the boxes and points of the mesh, after it was refitted."""
