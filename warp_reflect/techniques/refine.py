@@ -352,7 +352,14 @@ def settle(
         records = [target.view, scene.neighbours, scene.triangle_records]
         limits = [DEPTH_STEP, FINE_STEP, NEARER_SHARE, CONVERGED, SKY]
         inputs = [*records, *picture, *how, *limits, *outputs]
-        vector.launch_blocks(refine_vector.settle_blocks_kernel, pixels.count, inputs, scene.device, settings.threads)
+        vector.launch_blocks(
+            refine_vector.settle_blocks_kernel,
+            pixels.count,
+            inputs,
+            scene.device,
+            settings.threads,
+            refine_vector.BLOCKS,
+        )
     else:
         inputs = [scene.view, scene.neighbours, scene.closed_patches, target.view, *picture, *how, *outputs]
         launch(settle_kernel, pixels.count, inputs, scene.device, settings.threads)
