@@ -194,12 +194,12 @@ def _worker(config: pytest.Config) -> tuple[int, int]:
 def _compile_once(locks: Path) -> None:
     """Of several processes one compiles a kernel module; the others wait for it, and find it in Warp's cache.
 
-    Each compiles one module at a time: every thread that compiles makes a precompiled header first.
+    Each compiles one module at a time: they leave no core idle.
     """
     import fcntl
 
     compile_module = launch._compile
-    launch._compilers = cache(lambda flags, process: ThreadPoolExecutor(1, "warp_reflect_compile"))
+    launch._compilers = cache(lambda process: ThreadPoolExecutor(1, "warp_reflect_compile"))
 
     def compile_alone(module: wp.Module, device: wp.Device) -> None:
         with open(locks / f"{module.name}.lock", "w") as lock:

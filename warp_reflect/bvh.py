@@ -74,42 +74,6 @@ def trace_pixels_kernel(
     index: wp.array(dtype=int),
     indexed: int,
     known: int,
-    # Outputs:
-    out_triangle: wp.array(dtype=int),
-    out_u: wp.array(dtype=float),
-    out_v: wp.array(dtype=float),
-    out_distance: wp.array(dtype=float),
-    out_status: wp.array(dtype=wp.uint8),
-):
-    """One thread per asked mirror pixel; known 1: what `bvh_vector.first_met` has left."""
-    i = first + wp.tid()
-    if indexed != 0:
-        i = index[i]
-        if i < 0:
-            return
-    met = answered(known, out_triangle[i], out_u[i], out_v[i], out_distance[i])
-    hit = trace_ray_from(mesh_id, scene, point[i], direction[i], normal[i], facets[pixel[i]], body, 0, 0.0, met)
-    out_triangle[i] = hit.triangle
-    out_u[i] = hit.u
-    out_v[i] = hit.v
-    out_distance[i] = hit.t
-    out_status[i] = wp.uint8(hit.status)
-
-
-@wp.kernel
-def retry_pixels_kernel(
-    first: int,
-    mesh_id: wp.uint64,
-    scene: SceneView,
-    # Mirror pixels:
-    facets: wp.array(dtype=int),
-    pixel: wp.array(dtype=int),
-    point: wp.array(dtype=wp.vec3),
-    normal: wp.array(dtype=wp.vec3),
-    direction: wp.array(dtype=wp.vec3),
-    body: OwnBody,
-    index: wp.array(dtype=int),
-    indexed: int,
     status: wp.array(dtype=wp.uint8),
     # Outputs:
     out_triangle: wp.array(dtype=int),
@@ -118,30 +82,39 @@ def retry_pixels_kernel(
     out_distance: wp.array(dtype=float),
     out_status: wp.array(dtype=wp.uint8),
 ):
-    """One thread per asked mirror pixel: a miss beside a hit, or without a neighbour, is asked again."""
+    """One thread per asked mirror pixel.
+
+    `known` is 1 for what `bvh_vector.first_met` has left. With a `status` a miss beside a hit, or without a neighbour, is asked
+    again: a kernel of its own would be compiled for as long as this one.
+    """
     i = first + wp.tid()
     if indexed != 0:
         i = index[i]
         if i < 0:
             return
-    if int(status[i]) != SKY:
-        return
-    again = int(0)
-    neighbours = int(0)
-    if i > 0:
-        if pixel[i - 1] == pixel[i] - 1:
-            neighbours += 1
-            if int(status[i - 1]) != SKY:
-                again = int(1)
-    if i + 1 < pixel.shape[0]:
-        if pixel[i + 1] == pixel[i] + 1:
-            neighbours += 1
-            if int(status[i + 1]) != SKY:
-                again = int(1)
-    if again == 0 and neighbours > 0:
-        return
-    hit = trace_ray(mesh_id, scene, point[i], moved_direction(direction[i]), normal[i], facets[pixel[i]], body, 0, 0.0)
-    if hit.status == SKY:
+    retry = status.shape[0]
+    ray = direction[i]
+    if retry != 0:
+        if int(status[i]) != SKY:
+            return
+        again = int(0)
+        neighbours = int(0)
+        if i > 0:
+            if pixel[i - 1] == pixel[i] - 1:
+                neighbours += 1
+                if int(status[i - 1]) != SKY:
+                    again = int(1)
+        if i + 1 < pixel.shape[0]:
+            if pixel[i + 1] == pixel[i] + 1:
+                neighbours += 1
+                if int(status[i + 1]) != SKY:
+                    again = int(1)
+        if again == 0 and neighbours > 0:
+            return
+        ray = moved_direction(ray)
+    met = answered(known, out_triangle[i], out_u[i], out_v[i], out_distance[i])
+    hit = trace_ray_from(mesh_id, scene, point[i], ray, normal[i], facets[pixel[i]], body, 0, 0.0, met)
+    if retry != 0 and hit.status == SKY:
         return
     out_triangle[i] = hit.triangle
     out_u[i] = hit.u
@@ -393,13 +366,13 @@ def trace_pixels(
     )
     if left:
         some = _with_status(layer, index, Status.NONE) if known else rays[8:]
-        inputs = [*rays[:8], *some, known, *outputs]
+        inputs = [*rays[:8], *some, known, compact.none(wp.uint8, scene.device), *outputs]
         launch.launch(trace_pixels_kernel, len(some[0]), inputs, scene.device, threads, split_min=TRACE_SPLIT_MIN)
     if left or missed:
         some = _with_status(layer, index, Status.SKY) if known else rays[8:]
         # The neighbours' answers are read from a copy, so that the order of threads cannot matter.
-        inputs = [*rays[:8], *some, wp.clone(layer.status), *outputs]
-        launch.launch(retry_pixels_kernel, len(some[0]), inputs, scene.device, threads, split_min=TRACE_SPLIT_MIN)
+        inputs = [*rays[:8], *some, 0, wp.clone(layer.status), *outputs]
+        launch.launch(trace_pixels_kernel, len(some[0]), inputs, scene.device, threads, split_min=TRACE_SPLIT_MIN)
     if scene.has_hole is not None:
         _past_holes(
             scene, layer, scene.mirror_tracer(part), gbuffer.triangle, pixels.pixel, body=rays[7], threads=threads

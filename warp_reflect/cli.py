@@ -17,7 +17,7 @@ from typing import Annotated, get_type_hints
 import cyclopts
 from cyclopts import Parameter
 
-from warp_reflect import images, pipeline
+from warp_reflect import images, kernels, pipeline
 from warp_reflect.devices import open_device as _open_device
 from warp_reflect.pipeline import DONE, IMPOSSIBLE, PART_WAY, SIDE_MAX, Job, one_line, plan_scene
 from warp_reflect.progress import reporting
@@ -176,6 +176,10 @@ def render(
             _check_time_limit(ranged.timelimit)
             if ranged.workers < 1:
                 raise ValueError(f"--workers: got {ranged.workers}, expected 1 or more")
+            if _is_rendered_here(ranged) and os.path.exists(stage):
+                # What every frame launches is compiled while the stage is opened.
+                device = _open_device(opened.device)
+                kernels.begin(kernels.of_eye(_settings(planned), device), device)
             names, channels, wanted, notes = _as_the_stage_asks(stage, names, aov, opened, planned)
             job = _job(stage, names, frames, channels, opened, wanted, ranged)
             if ranged.print_job is not None:
@@ -200,6 +204,11 @@ def render(
                 report.line(traceback.format_exc())
             report.line(f"error: {one_line(error)}")
             return IMPOSSIBLE
+
+
+def _is_rendered_here(ranged: RangeOptions) -> bool:
+    """Whether this process makes a frame, as far as its options tell."""
+    return ranged.workers == 1 and not (ranged.scheduler or ranged.resume or ranged.print_job)
 
 
 def _as_the_stage_asks(stage: str, names: list[str], aov: str | None, opened: StageOptions, planned: PlanOptions):

@@ -75,7 +75,7 @@ def of_view(settings: Settings, device: wp.DeviceLike, casting: bool = False, mi
     if mirrors:
         asked += ["-surface", "|surface_vector"]
     if casting:
-        asked += ["direct", "|shadow_starts_vector", "-shadow_starts/plain"]
+        asked += ["direct", "|shadow_starts_vector", "-shadow_starts/plain", "shade"]
         asked += ["|wide_tree", "|shadows_vector", "-shadows/tried"]
     return _of(asked, vectors(settings, device))
 

@@ -11,13 +11,15 @@ bit-equal at any number of threads.
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
+import tempfile
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache, partial
 from time import perf_counter, thread_time
 from typing import ClassVar
@@ -41,14 +43,17 @@ CUDA_BLOCK_DIM = 128
 MOST_REGISTERS = 168
 SLICE_ALIGN = 64  # elements; slices that share a cache line of results would ping-pong it
 
-# Warp's own default (the option replaces it), without a number type that no kernel has: a third of what its header costs.
+# Warp's own default (the option replaces it), without a number type that no kernel has: a third of what its header costs. What
+# the header asks of its templates is made once with it, and not again in every module: 50 ms each.
 PLAIN_FLAGS = (
     "-march=native -mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000"
-    " -mllvm=-slp-recursion-max-depth=4 -DWP_NO_BFLOAT16"
+    " -mllvm=-slp-recursion-max-depth=4 -DWP_NO_BFLOAT16 -fpch-instantiate-templates"
 )
 # And one flag: without NaN the box test's min and max are single instructions, which makes a query 1.5 to 1.8 times as fast.
 # Warp's headers name NAN: no warnings about that. CUDA builds ignore the option.
 FINITE_FLAGS = f"{PLAIN_FLAGS} -menable-no-nans -Wno-nan-infinity-disabled"
+# That flag changes what is made of the header's code, not the header: one does for both.
+ALIKE_FLAGS = PLAIN_FLAGS, FINITE_FLAGS
 
 
 # Of launches that were split, by their kernel and (binary) order of magnitude: what an element took last time. [s]
@@ -268,6 +273,11 @@ def ready(modules: Iterable[wp.Module], device) -> list[Future]:
     return [_begun(module, wp.get_device(device)) for module in modules]
 
 
+def is_compiling() -> bool:
+    """Whether a kernel module is on its way."""
+    return not all(loading.done() for loading in _loaded.values())
+
+
 def _load(kernel, device) -> None:
     # The module must be compiled and loaded before threads race for it.
     device = wp.get_device(device)
@@ -284,31 +294,82 @@ def _begun(module: wp.Module, device: wp.Device) -> Future:
     key = module, str(device), os.getpid()
     if key not in _loaded:
         module.options["cpu_compiler_flags"] = module.options["cpu_compiler_flags"] or PLAIN_FLAGS
-        pool = _compilers(module.options["cpu_compiler_flags"], os.getpid())
-        _loaded[key] = pool.submit(_compile, module, device)
+        _loaded[key] = _compilers(os.getpid()).submit(_compile, module, device)
     return _loaded[key]
 
 
 @cache
-def _compilers(flags: str, process: int) -> ThreadPoolExecutor:
-    """Threads that compile with the same flags.
+def _compilers(process: int) -> ThreadPoolExecutor:
+    """Threads that compile, one per core.
 
-    Each thread keeps the precompiled header of Warp's own code for its flags, which costs as much as a module or two: so
-    threads are not shared between flags. Nearly all modules have `PLAIN_FLAGS`; half of the cores are for others. Flags
-    that differ in what `-mllvm` sets would not do: Warp compiles those one after the other.
+    Flags that differ in what `-mllvm` sets would not do: Warp compiles those one after the other.
     """
-    cores = thread_count("cpu")
-    return ThreadPoolExecutor(
-        cores if flags == PLAIN_FLAGS else max(1, cores // 2), thread_name_prefix="warp_reflect_compile"
-    )
+    return ThreadPoolExecutor(thread_count("cpu"), "warp_reflect_compile", _headers(process).share)
 
 
 def _compile(module: wp.Module, device: wp.Device) -> None:
     # Not begun where the program is at its end, which waits for these threads.
     if threading.main_thread().is_alive():
-        # With the block size of a CPU launch: it is part of the module's identity, and another one would compile
-        # everything a second time.
-        module.load(device, CPU_BLOCK_DIM)
+        with _headers(os.getpid()).at_hand(module.options["cpu_compiler_flags"]):
+            # With the block size of a CPU launch: it is part of the module's identity, and another one would compile
+            # everything a second time.
+            module.load(device, CPU_BLOCK_DIM)
+
+
+@cache
+def _headers(process: int) -> _Headers:
+    return _Headers()
+
+
+class _Headers:
+    """Precompiled headers of Warp's own code, one for every set of flags, that the threads which compile share.
+
+    Each costs as much as a module or two, and Warp has each thread make its own, in a folder of its own.
+    """
+
+    def __init__(self):
+        self._folder = tempfile.TemporaryDirectory(prefix="wp_pch_")
+        self._is_shared = False
+        self._makes: dict[tuple[str, ...], threading.Lock] = {}
+        self._made: set[str] = set()
+
+    def share(self) -> None:
+        """Have the calling thread's headers be those of all."""
+        with suppress(AttributeError):  # a version of Warp that keeps them elsewhere: they are not shared
+            wp._src.context.runtime._pch_dirs[threading.get_ident()] = self._folder
+            self._is_shared = True
+
+    @contextmanager
+    def at_hand(self, flags: str) -> Iterator[None]:
+        """In the context a module is compiled with these flags, or loaded; by one thread while there is no header for them."""
+        if self._is_shared and flags not in self._made:
+            alike = ALIKE_FLAGS if flags in ALIKE_FLAGS else (flags,)
+            with self._makes.setdefault(alike, threading.Lock()):
+                if flags not in self._made:
+                    before = set(os.listdir(self._folder.name))
+                    yield
+                    self._keep(set(os.listdir(self._folder.name)) - before, flags, alike)
+                    return
+        yield
+
+    def _keep(self, names: set[str], flags: str, alike: tuple[str, ...]) -> None:
+        """Of new files one, if any, is a header for these flags; it is given the names of those that would be the same."""
+        if names:
+            self._made.add(flags)
+        own = _flags_hash(flags)
+        for name, other in itertools.product(names, alike):
+            place = os.path.join(self._folder.name, name.replace(own, _flags_hash(other)))
+            if own in name and not os.path.exists(place):
+                os.link(os.path.join(self._folder.name, name), place)
+                self._made.add(other)
+
+
+def _flags_hash(flags: str) -> str:
+    """What Warp tells headers apart by: FNV-1a of 64 bits over each flag and a zero byte (warp/native/clang/clang.cpp)."""
+    told = 0xCBF29CE484222325
+    for byte in b"".join(flag.encode() + b"\0" for flag in flags.split()):
+        told = (told ^ byte) * 0x100000001B3 % 2**64
+    return f"{told:016x}"
 
 
 def run_parallel(jobs: list[Callable[[], None]]) -> None:

@@ -16,6 +16,7 @@ from warp_reflect import (
     choice,
     detail,
     kernels,
+    launch,
     mirrored_eyes,
     raster,
     vector,
@@ -39,7 +40,6 @@ from warp_reflect.effects import (
     lobe_rays,
     pane_rays,
 )
-from warp_reflect.launch import thread_count
 from warp_reflect.layers import Camera, GBuffer
 from warp_reflect.lighting import LightRow, are_clear, needs_probe, plan_lights, shadows_of
 from warp_reflect.plan_rows import (
@@ -118,7 +118,7 @@ class Plan:
         """Predicted milliseconds of a frame whatever is chosen: the eye's view, the shading, finishes, panes, bounces."""
         width, height = self.size
         seen = sum(row.pixels for row in self.rows)
-        triangles, threads = self.scene.triangle_count, thread_count(self.scene.device, self.settings.threads)
+        triangles, threads = self.scene.triangle_count, launch.thread_count(self.scene.device, self.settings.threads)
         cast = [row.effects["shadows"].numbers for row in self.lights if row.effects["shadows"].on]
         shadows = sum(numbers.get("ms", 0.0) for numbers in cast)
         point = sum(numbers.get("ms", 0.0) / max(numbers.get("points", 0), 1) for numbers in cast)
@@ -387,6 +387,15 @@ def make_plan(
     if method == "none":
         found = []
     pixels, seen = _look(scene, view, [k for k, _, _ in found], clear, settings)
+    if launch.is_compiling() and not (settings.max_error_px or settings.budget_ms):
+        # What techniques launch is told before the lights are: those are tried for as long as that is compiled. The choice may
+        # yet be another one, where shadows decide it: then a module or two will have been in vain.
+        ask = scene, view, settings, method
+        guess = [
+            row_of(*ask, number, k, part, weight, pixels[k], [], costs)
+            for number, (k, part, weight) in enumerate(found, 1)
+        ]
+        kernels.begin(kernels.of_plan(Plan(*ask, guess, [], [], [], costs)), scene.device)
     tried, lights = _tried(scene, seen, pixels, [k for k, _, _ in found], settings, costs)
     # What techniques draw themselves is shadowed where the picture is.
     cast = shadows_of(lights, settings)
@@ -711,4 +720,4 @@ def _options(made: Plan, row: PlanRow) -> list[choice.Option]:
         work["raytraced"] = applicable.work_of(scene, row.reflector, camera, "raytraced", row.pixels, settings)
         far = applicable.far_environment(*ask, settings.max_error_px or float("inf"))
         work |= {far.technique: far.work} if far is not None else {}
-    return choice.options_of(work, settings, made.costs, thread_count(scene.device, settings.threads))
+    return choice.options_of(work, settings, made.costs, launch.thread_count(scene.device, settings.threads))
