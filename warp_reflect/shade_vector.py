@@ -22,6 +22,7 @@ from warp_reflect.textures import Look
 wp.set_module_options({"enable_backward": False})
 
 EYE_BLOCKS = 4  # blocks of pixels a task: what does not change along them (lights, camera) is spread into vectors once
+RAY_BLOCKS = 4  # blocks of rays a task, where all of them are split over threads just the same
 HITS_SPLIT_MIN = 16  # blocks of rays; those of a few pixels meet triangles all over the scene, at 8 us a block
 
 
@@ -95,6 +96,7 @@ HITS_SPLIT_MIN = 16  # blocks of rays; those of a few pixels meet triangles all 
 
         // textures.plain_look without the mesh's colours, or what was looked up before.
         Triangles triangles;
+        bool alone = false;
         I patch = I(0), at = I(0), colored = I(0), even = I(0), bare = I(0);
         V base_color, f0, f90, emissive;
         F roughness, clearcoat = F(0.0f), clearcoat_roughness, clearcoat_f0, opacity, through;
@@ -102,7 +104,7 @@ HITS_SPLIT_MIN = 16  # blocks of rays; those of a few pixels meet triangles all 
             triangles = triangles_of(tri);
             patch = patch_of(triangles);
             at = looked_up ? look_words * own : material_words * of_patch(&patches->material, triangles, patch);
-            const bool alone = triangles.one_patch && !looked_up;
+            alone = triangles.one_patch && !looked_up;
             F field[18];
             if (alone) {
                 _Pragma("clang loop unroll(full)") for (int k = 0; k < 18; ++k) field[k] = F(table[at[0] + k]);
@@ -176,7 +178,7 @@ HITS_SPLIT_MIN = 16  # blocks of rays; those of a few pixels meet triangles all 
                 if (bits(seen & has_color)) {
                     const V mixed = between(colors, u, v);
                     base_color = vpick(has_color, mixed, base_color);
-                    const F metallic = gather(&materials->metallic, at);
+                    const F metallic = alone ? F((&materials->metallic)[at[0]]) : gather(&materials->metallic, at);
                     const I metal = has_color & (metallic > 0.0f);
                     const V tint = times(metallic, mixed);
                     f0 = vpick(metal, add(grey((1.0f - metallic) * clearcoat_f0), tint), f0);
@@ -378,9 +380,20 @@ def shade_rays(
     """What `shade.seen_radiance_kernel` does; `light` as in `shade_eye`."""
     device = scene.device
     rays = [layer.pixels.direction, layer.u, layer.v]
-    inputs = [1, 0, scene.view, scene.triangle_records, gbuffer.view, *light, layer.triangle, none(int, device), *rays]
+    blocks = RAY_BLOCKS
+    inputs = [
+        blocks,
+        0,
+        scene.view,
+        scene.triangle_records,
+        gbuffer.view,
+        *light,
+        layer.triangle,
+        none(int, device),
+        *rays,
+    ]
     inputs += [none(wp.vec4, device), none(wp.vec3, device), radiance]
-    vector.launch_blocks(shade_blocks_kernel, layer.pixels.count, inputs, device, threads, split_min=HITS_SPLIT_MIN)
+    vector.launch_blocks(shade_blocks_kernel, layer.pixels.count, inputs, device, threads, blocks, HITS_SPLIT_MIN)
 
 
 @wp.func_native(

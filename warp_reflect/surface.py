@@ -368,8 +368,9 @@ def _met(
     if vector.chosen(kernels, device):
         from warp_reflect import surface_vector  # which reflects at this module's surface
 
-        inputs = [scene.view, scene.triangle_records, *seen, *outputs]
-        vector.launch_blocks(surface_vector.mirror_blocks_kernel, n, inputs, device, threads)
+        kernel, blocks = surface_vector.mirror_blocks_kernel, surface_vector.MIRROR_BLOCKS
+        inputs = [blocks, scene.view, scene.triangle_records, *seen, *outputs]
+        vector.launch_blocks(kernel, n, inputs, device, threads, blocks=blocks)
     else:
         launch.launch(mirror_pixels_kernel, n, [scene.view, *seen, *outputs], device, threads)
     return mirror

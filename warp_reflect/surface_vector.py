@@ -20,6 +20,7 @@ from warp_reflect.surface import LEAST_NORMAL, SURE_SLOPE, mirror_pixel
 wp.set_module_options({"enable_backward": False})
 
 BLOCK = wp.constant(vector.BLOCK)
+MIRROR_BLOCKS = 4  # blocks of mirror pixels a task: the scene and the camera, which a task copies, are large
 LISTED_IDS = 32  # each has a number in every block of pixels
 
 
@@ -40,11 +41,14 @@ LISTED_IDS = 32  # each has a number in every block of pixels
         const I valid = element < end;
         const I at = start + LANES <= end ? iload(pixel.data + start)
                                           : igather(pixel.data, ipick(valid, element, I(end - 1)));
+        // Mostly side by side in a row.
+        const int first = at[0];
+        const bool row = !bits(at != first + lanes());
         F column, line;
         place(at, camera.width, column, line);
         const Sight of_eye = sight(column + 0.5f, line + 0.5f);
         const V ray = of_eye.ray;
-        const I tri = igather(triangle.data, at);
+        const I tri = irow(triangle.data, first, row, at);
         const I patch = igather(scene.triangle_patch.data, tri);
         const int* of_shape = &patches->shape;
         const I shape = !bits(patch != patch[0]) ? I(of_shape[patch_words * patch[0]]) : igather(of_shape, patch_words * patch);
@@ -55,7 +59,7 @@ LISTED_IDS = 32  # each has a number in every block of pixels
         const I quadric = shape == shape_quadric;
         if (!parallel && bits(quadric)) {
             // surface.polish, where its first root is sure
-            const F key = gather(depth_key.data, at);
+            const F key = frow(depth_key.data, first, row, at);
             const V start_at = add(eye, V{ray.x / key, ray.y / key, ray.z / key});
             const V q = in_quadric(of, start_at);
             const V d = V{dot(of.row[0], incident), dot(of.row[1], incident), dot(of.row[2], incident)};
@@ -146,6 +150,7 @@ def mirror_block(
 @wp.kernel
 def mirror_blocks_kernel(
     first: int,
+    blocks: int,
     scene: SceneView,
     records: wp.array(dtype=float),
     camera: CameraView,
@@ -156,30 +161,31 @@ def mirror_blocks_kernel(
     out_normal: wp.array(dtype=wp.vec3),
     out_direction: wp.array(dtype=wp.vec3),
 ):
-    """One thread per block of mirror pixels."""
-    block = first + wp.tid()
-    left = mirror_block(
-        block,
-        scene,
-        records,
-        camera,
-        triangle,
-        depth_key,
-        pixel,
-        SHAPE_QUADRIC,
-        SHAPE_PLANE,
-        SURE_SLOPE,
-        LEAST_NORMAL,
-        out_point,
-        out_normal,
-        out_direction,
-    )
-    i = block * BLOCK
-    while left != wp.uint64(0):
-        if (left & wp.uint64(1)) != wp.uint64(0):
-            mirror_pixel(scene, camera, triangle, depth_key, pixel[i], i, out_point, out_normal, out_direction)
-        left = left >> wp.uint64(1)
-        i += 1
+    """One thread per `blocks` blocks of mirror pixels."""
+    task = first + wp.tid()
+    for block in range(task * blocks, wp.min((task + 1) * blocks, (pixel.shape[0] + BLOCK - 1) / BLOCK)):
+        left = mirror_block(
+            block,
+            scene,
+            records,
+            camera,
+            triangle,
+            depth_key,
+            pixel,
+            SHAPE_QUADRIC,
+            SHAPE_PLANE,
+            SURE_SLOPE,
+            LEAST_NORMAL,
+            out_point,
+            out_normal,
+            out_direction,
+        )
+        i = block * BLOCK
+        while left != wp.uint64(0):
+            if (left & wp.uint64(1)) != wp.uint64(0):
+                mirror_pixel(scene, camera, triangle, depth_key, pixel[i], i, out_point, out_normal, out_direction)
+            left = left >> wp.uint64(1)
+            i += 1
 
 
 @wp.func_native(
@@ -194,10 +200,17 @@ def mirror_blocks_kernel(
     int i = begin;
     for (; i + LANES <= end; i += LANES) {
         const I t = iload(seen + i);
+        const int first = seen[i];
+        // Side by side lie pixels of one triangle, and where there is nothing; or else of one patch.
+        bool alike = !bits(t != first);
+        I patch;
+        if (!alike && !bits(t < 0)) {
+            EACH_LANE patch[l] = triangle_patch.data[seen[i + l]];
+            alike = !bits(patch != patch[0]);
+        }
         I id;
-        // Side by side lie pixels of one triangle, and where there is nothing.
-        if (!bits(t != seen[i])) {
-            id = I(id_of(seen[i]));
+        if (alike) {
+            id = I(id_of(first));
             count(id[0], LANES);
         } else EACH_LANE {
             id[l] = id_of(t[l]);

@@ -158,7 +158,7 @@ _HEAD = r"""
         out[2] = first_pairs(u, v);
         out[3] = last_pairs(u, v);
     };
-    // Row floats.
+    // Eight floats.
     auto gather8 = [fours](const float* p, I start, F* out) {
         int at[LANES];
         __builtin_memcpy(at, &start, sizeof(at));
