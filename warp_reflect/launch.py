@@ -52,8 +52,11 @@ PLAIN_FLAGS = (
 # And one flag: without NaN the box test's min and max are single instructions, which makes a query 1.5 to 1.8 times as fast.
 # Warp's headers name NAN: no warnings about that. CUDA builds ignore the option.
 FINITE_FLAGS = f"{PLAIN_FLAGS} -menable-no-nans -Wno-nan-infinity-disabled"
-# That flag changes what is made of the header's code, not the header: one does for both.
-ALIKE_FLAGS = PLAIN_FLAGS, FINITE_FLAGS
+# What is in vectors already gains nothing from a search for more of them, which is a twelfth of compiling it; plain kernels get
+# slower without it.
+VECTOR_FLAGS = f"{PLAIN_FLAGS} -fno-slp-vectorize"
+# These flags change what is made of the header's code, not the header: one does for all.
+ALIKE_FLAGS = PLAIN_FLAGS, FINITE_FLAGS, VECTOR_FLAGS
 
 
 # Of launches that were split, by their kernel and (binary) order of magnitude: what an element took last time. [s]
@@ -293,7 +296,8 @@ def _begun(module: wp.Module, device: wp.Device) -> Future:
     # A process that was forked has none of its parent's threads: it begins anew, with what is loaded already.
     key = module, str(device), os.getpid()
     if key not in _loaded:
-        module.options["cpu_compiler_flags"] = module.options["cpu_compiler_flags"] or PLAIN_FLAGS
+        own = VECTOR_FLAGS if "_vector" in module.name.rpartition(f"{__package__}.")[2] else PLAIN_FLAGS
+        module.options["cpu_compiler_flags"] = module.options["cpu_compiler_flags"] or own
         _loaded[key] = _compilers(os.getpid()).submit(_compile, module, device)
     return _loaded[key]
 
