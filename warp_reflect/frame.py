@@ -134,8 +134,11 @@ class Frame:
         image = self._group(group)
         if group in POINTS:
             there = (self._group("status") > 0) if group == "mirrorPoint" else self["reflectedId"] > 0
-            world = image.astype(np.float64) + self.camera.eye
-            image = np.where(there[..., None], world, 0.0).astype(np.float32)
+            # Added in float64, rounded once; without a copy of the picture in float64.
+            world = np.empty(image.shape, np.float32)
+            np.add(image, self.camera.eye, out=world, dtype=np.float64, casting="same_kind")
+            world[~there] = 0.0
+            image = world
         return image if component is None else image[..., component]
 
     def relative(self, name: str) -> np.ndarray:

@@ -19,6 +19,7 @@ from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
+PNG_LEVEL = 4  # of zlib's 9: half the time of its default, 6, for a file that is 6 % larger
 FORMATS = {".exr": "openexr", ".png": "png"}  # JPEG is left out: its writer ends the process on a full disk
 COLOR_CHANNELS = frozenset({"R", "G", "B", "A", "RGB", "RGBA", "reflection"})  # half in an EXR
 HALF_MAX = 65504.0  # largest finite half
@@ -182,7 +183,7 @@ def write_exr(
             if plane.shape != (height, width):
                 raise ValueError(f"channel '{name}': got shape {plane.shape}, expected {(height, width)} as the first")
             with np.errstate(over="ignore"):
-                values = plane.astype(np.float32)
+                values = plane.astype(np.float32, copy=False)
             good = np.isfinite(values)
             if not good.all():
                 replaced += int(good.size - np.count_nonzero(good))
@@ -245,6 +246,7 @@ def write_png(path: str | os.PathLike, rgb: np.ndarray, attributes: Mapping[str,
     spec = oiio.ImageSpec(width, height, channel_count, oiio.UINT8)
     spec.attribute("oiio:ColorSpace", "srgb_rec709_scene")
     spec.attribute("oiio:UnassociatedAlpha", 1)
+    spec.attribute("png:compressionLevel", PNG_LEVEL)
     spec.attribute("DateTime", "")
     texts = {name: str(value).encode() for name, value in (attributes or {}).items()}
     _write_whole(Path(path), "png", [(spec, [pixels[..., k] for k in range(channel_count)])], texts)
