@@ -22,7 +22,7 @@ FILES = {
 # A module imports from its own floor or below. A new module belongs into this table; `x.*` is a folder.
 FLOORS = {
     1: "settings launch compact counts vector direct_vector hits_vector packets wide_packets wide_tree devices optics "
-    "shapes bodies topology cubemap quadrics quadric_roots quadric_curve quadric_fit heightfield heightfield_vector "
+    "any_hit shapes bodies topology cubemap quadrics quadric_roots quadric_curve quadric_fit heightfield heightfield_vector "
     "grid_rays occupancy voxels "
     "images metrics timing clipping cutouts",
     2: "scene scene_times reflectors environment_maps baked_maps "

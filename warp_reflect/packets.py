@@ -9,6 +9,22 @@ from __future__ import annotations
 
 # After `vector.snippet`'s head.
 RAYS = r"""
+    typedef float Four __attribute__((ext_vector_type(4)));
+    // The least or the most of a vector, half by half: the compiler's own reduction minds NaN, one lane after the other.
+    auto folded = [](F v, auto better) -> float {
+#if defined(__AVX512F__)
+        const Row eight = better(__builtin_shufflevector(v, v, 0, 1, 2, 3, 4, 5, 6, 7),
+            __builtin_shufflevector(v, v, 8, 9, 10, 11, 12, 13, 14, 15));
+#else
+        const Row eight = v;
+#endif
+        const Four four = better(__builtin_shufflevector(eight, eight, 0, 1, 2, 3),
+            __builtin_shufflevector(eight, eight, 4, 5, 6, 7));
+        const Four two = better(four, __builtin_shufflevector(four, four, 2, 3, 0, 1));
+        return better(two, __builtin_shufflevector(two, two, 1, 0, 3, 2))[0];
+    };
+    auto lesser = [](auto a, auto b) { return a < b ? a : b; };
+    auto larger = [](auto a, auto b) { return a > b ? a : b; };
     struct Met { I face; F t, u, v; };
     // ray_walk.flush_direction
     auto flushed = [&](V d) -> V {
@@ -112,6 +128,6 @@ RAYS = r"""
     // How many vectors of rays go together, and whether those after the first are empty.
     struct One { enum { value = 1 }; static constexpr bool first_alone() { return false; } };
     struct Two { enum { value = 2 }; static constexpr bool first_alone() { return false; } };
-    (void)flushed; (void)slab;
+    (void)flushed; (void)slab; (void)folded; (void)lesser; (void)larger;
 #define EACH_GROUP _Pragma("clang loop unroll(full)") for (int g = 0; g < GROUPS; ++g)
 """

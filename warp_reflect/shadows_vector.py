@@ -1,6 +1,6 @@
 """The rays of `shadows.py`'s kernels for a block of points at a time.
 
-The same rays, to the last bit, in packets (`wide_packets.py`): those of neighbouring points towards the same sample, or a point's
+The same rays, to the last bit, in packets (`any_hit.py`): those of neighbouring points towards the same sample, or a point's
 own samples.
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 import warp as wp
 
 from warp_reflect import compact, vector
+from warp_reflect.any_hit import ANY_HIT
 from warp_reflect.direct import CYLINDER, SPHERE, DirectView
 from warp_reflect.launch import launch
 from warp_reflect.shadow_neighbours import (
@@ -25,7 +26,6 @@ from warp_reflect.shadow_neighbours import (
     Neighbours,
 )
 from warp_reflect.shadow_starts import Starts
-from warp_reflect.wide_packets import TRAVERSAL
 
 wp.set_module_options({"enable_backward": False})
 
@@ -38,7 +38,7 @@ CODES += [SAME_TURN, FLATNESS, LEAST_COUNT, SHARP, LEAST_SPREAD, STEEP]
 
 @wp.func_native(
     vector.snippet(
-        TRAVERSAL
+        ANY_HIT
         + r"""
     const int begin = block * BLOCK;
     const int end = begin + BLOCK < count ? begin + BLOCK : count;
@@ -129,110 +129,90 @@ CODES += [SAME_TURN, FLATNESS, LEAST_COUNT, SHARP, LEAST_SPREAD, STEEP]
     const int area_count = lights.areas.shape[0], distant_count = lights.distant.shape[0];
     const bool to_sky = mode == sky_mode, only_first = mode == first_mode, each = mode == each_mode;
     const bool sharing = mode == shared_mode, to_all = !to_sky && !only_first && !each && !sharing;
-    float sum_x[BLOCK], sum_y[BLOCK], sum_z[BLOCK], share[BLOCK], known[BLOCK], brought[BLOCK], arrived[BLOCK], before[BLOCK];
+    float share[BLOCK], known[BLOCK], before[BLOCK];
+    V total[GROUPS];
+    for (int v = 0; v < GROUPS; ++v) total[v] = same(0.0f);
     int asking[BLOCK];
-    for (int j = 0; j < BLOCK; ++j) sum_x[j] = sum_y[j] = sum_z[j] = 0.0f;
-    // shadow_neighbours.place_of, found_around, shared_share
+    // Where vectors of points lie in the pictures of what rays find (shadow_neighbours.place_of); most lie side by side in a row.
+    typedef unsigned char Entries __attribute__((ext_vector_type(LANES)));
     const int line = around.width + 2 * neighbours;
+    const bool pictured = sharing || to_all || only_first, listed = around.pixel.shape[0] > 0;
     int number[BLOCK], place[BLOCK];
-    for (int j = 0; (sharing || to_all || only_first) && j < end - begin; ++j) {
-        number[j] = around.pixel.shape[0] > 0 ? around.pixel.data[begin + j] : begin + j;
-        place[j] = number[j] + 2 * neighbours * (number[j] / around.width) + neighbours * line + neighbours;
+    bool straight[GROUPS];
+    for (int v = 0; pictured && v < GROUPS; ++v) {
+        const int start = begin + v * LANES;
+        if (start >= end) break;
+        const I own = start + lanes() < end ? start + lanes() : I(end - 1);
+        const I pixel = listed ? igather(around.pixel.data, own) : own;
+        const int row = pixel[0] / around.width;
+        straight[v] = start + LANES <= end && (row + 1) * around.width - pixel[0] >= LANES && !bits(pixel != pixel[0] + lanes());
+        const I rows_before = straight[v] ? I(row) : pixel / around.width;
+        istore(number + v * LANES, pixel);
+        istore(place + v * LANES, pixel + 2 * neighbours * rows_before + neighbours * line + neighbours);
     }
-    auto found_around = [&](const unsigned char* found, int at) -> int {
-        unsigned long long together = 0;
-        for (int y = -neighbours; y <= neighbours; ++y) {
-            unsigned long long row;
-            __builtin_memcpy(&row, found + at + y * line - neighbours, sizeof(row));
-            together |= row;
-        }
-        together &= (1ull << (8 * (2 * neighbours + 1))) - 1;
-        together |= together >> 32;
-        together |= together >> 16;
-        together |= together >> 8;
-        return (int)(together & (dark | lit));
+    auto entries = [&](const unsigned char* of, int v, int step) -> Entries {
+        Entries e;
+        if (straight[v]) __builtin_memcpy(&e, of + place[v * LANES] + step, sizeof(e));
+        else EACH_LANE e[l] = of[place[v * LANES + l] + step];
+        return e;
     };
-    // Of points `own` of the block, as many as there are.
-    auto shared_shares = [&](const unsigned char* shared, const float* unshadowed, const int* own, int asks, float* out) {
-        for (int from = 0; from < asks; from += LANES) {
-            int here[LANES], pixel[LANES], entry_at[LANES], other[LANES];
-            bool in_fours = true;
-            for (int l = 0; l < LANES; ++l) {
-                const int j = own[from + l < asks ? from + l : asks - 1];
-                here[l] = begin + j;
-                pixel[l] = number[j];
-                entry_at[l] = place[j];
-                in_fours &= (l & 3) == 0 || (pixel[l] - pixel[l - 1] == 1);
+    auto numbers = [](Entries e) -> I { return __builtin_convertvector(e, I); };
+    // shadow_neighbours.found_around
+    auto found_around = [&](const unsigned char* found, int v) -> I {
+        Entries together = Entries(0);
+        for (int y = -neighbours; y <= neighbours; ++y)
+            for (int x = -neighbours; x <= neighbours; ++x) together |= entries(found, v, y * line + x);
+        return numbers(together) & (dark | lit);
+    };
+    // shadow_neighbours.shared_share of a vector of points, lanes `asked` of it.
+    auto shared_shares = [&](const unsigned char* shared, const float* unshadowed, int v, I asked) -> F {
+        const int start = begin + v * LANES;
+        auto own_row = [&](int r) -> F { return load(rows + r * stride + start); };
+        const V p = V{own_row(0), own_row(1), own_row(2)}, side = V{own_row(6), own_row(7), own_row(8)};
+        const I here = start + lanes(), pixel = iload(number + v * LANES);
+        I known = I(0), total = I(0), squares = I(0);
+        I sum_x = I(0), sum_y = I(0), square_x = I(0), along_x = I(0), along_y = I(0);
+        F brought = F(0.0f), arrived = F(0.0f);
+        for (int y = -neighbours; y <= neighbours; ++y) {
+            for (int x = -neighbours; x <= neighbours; ++x) {
+                const I entry = numbers(entries(shared, v, y * line + x));
+                const I there = asked & (entry != 0);
+                const unsigned some = bits(there);
+                if (!some) continue;
+                I other = ipick(there, pixel + (y * around.width + x), I(0));
+                if (around.index.shape[0] > 0) other = igather(around.index.data, other);
+                // Points of pixels beside each other mostly follow one another.
+                const int lead = __builtin_ctz(some), from = other[lead] - lead;
+                const bool beside_each = from >= 0 && from + LANES <= stride && !bits(there & (other != from + lanes()));
+                if (!beside_each) other = ipick(there, other, here);
+                auto pull = [&](const float* of) -> F { return beside_each ? load(of + from) : gather(of, other); };
+                auto row = [&](int r) -> F { return pull(rows + r * stride); };
+                const V away = sub(V{row(0), row(1), row(2)}, p);
+                const F beside = dot(side, away);
+                const F turned = dot(side, V{row(6), row(7), row(8)});
+                const I near = there & (beside * beside <= flatness * flatness * dot(away, away)) & (turned >= same_turn);
+                if (!bits(near)) continue;
+                const I level = near & entry >> 2;
+                known -= near;
+                total += level;
+                squares += level * level;
+                sum_x += near & x;
+                sum_y += near & y;
+                square_x += near & x * x;
+                along_x += x * level;
+                along_y += y * level;
+                const F brings = pull(unshadowed);
+                brought = pick(near, brought + brings, brought);
+                arrived = pick(near, arrived + brings * __builtin_convertvector(level, F), arrived);
             }
-            // Four pixels beside each other are mostly four points after one another.
-            auto pull = [&](const float* of, const int* index, bool fours) -> F {
-                F v;
-                if (fours) {
-                    Four part[LANES / 4];
-                    for (int h = 0; h < LANES / 4; ++h) __builtin_memcpy(&part[h], of + index[4 * h], sizeof(Four));
-#if defined(__AVX512F__)
-                    const auto low = __builtin_shufflevector(part[0], part[1], 0, 1, 2, 3, 4, 5, 6, 7);
-                    const auto high = __builtin_shufflevector(part[2], part[3], 0, 1, 2, 3, 4, 5, 6, 7);
-                    v = __builtin_shufflevector(low, high, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
-#else
-                    v = __builtin_shufflevector(part[0], part[1], 0, 1, 2, 3, 4, 5, 6, 7);
-#endif
-                } else {
-                    EACH_LANE v[l] = of[index[l]];
-                }
-                return v;
-            };
-            const V p = V{pull(rows, here, false), pull(rows + stride, here, false), pull(rows + 2 * stride, here, false)};
-            const V side = V{pull(rows + 6 * stride, here, false), pull(rows + 7 * stride, here, false),
-                pull(rows + 8 * stride, here, false)};
-            I known = I(0), total = I(0), squares = I(0);
-            I sum_x = I(0), sum_y = I(0), square_x = I(0), along_x = I(0), along_y = I(0);
-            F brought = F(0.0f), arrived = F(0.0f);
-            for (int y = -neighbours; y <= neighbours; ++y) {
-                for (int x = -neighbours; x <= neighbours; ++x) {
-                    const int step = y * around.width + x, entry_step = y * line + x;
-                    I entry;
-                    EACH_LANE entry[l] = shared[entry_at[l] + entry_step];
-                    const I there = entry != 0;
-                    if (!bits(there)) continue;
-                    bool fours = in_fours;
-                    for (int l = 0; l < LANES; ++l) {
-                        int i = pixel[l] + step;
-                        if (around.index.shape[0] > 0 && there[l]) i = around.index.data[i];
-                        other[l] = there[l] ? i : -1;
-                    }
-                    for (int l = 0; l < LANES; ++l) fours &= other[l] >= 0 && other[l] - other[l & ~3] == (l & 3);
-                    if (!fours) for (int l = 0; l < LANES; ++l) other[l] = other[l] < 0 ? here[l] : other[l];
-                    auto row = [&](int r) -> F { return pull(rows + r * stride, other, fours); };
-                    const V away = sub(V{row(0), row(1), row(2)}, p);
-                    const F beside = dot(side, away);
-                    const F turned = dot(side, V{row(6), row(7), row(8)});
-                    const I near = there & (beside * beside <= flatness * flatness * dot(away, away)) & (turned >= same_turn);
-                    if (!bits(near)) continue;
-                    const I level = near & entry >> 2;
-                    known -= near;
-                    total += level;
-                    squares += level * level;
-                    sum_x += near & x;
-                    sum_y += near & y;
-                    square_x += near & x * x;
-                    along_x += x * level;
-                    along_y += y * level;
-                    const F brings = pull(unshadowed, other, fours);
-                    brought = pick(near, brought + brings, brought);
-                    arrived = pick(near, arrived + brings * __builtin_convertvector(level, F), arrived);
-                }
-            }
-            const I spread = total * (levels * known - total), between = known * squares - total * total;
-            const I edge = (sharp * between > spread) & (least_spread * spread > levels * levels * known * known);
-            const F slope_x = __builtin_convertvector(known * along_x - total * sum_x, F);
-            const F slope_y = __builtin_convertvector(known * along_y - total * sum_y, F);
-            const F limit = steep * __builtin_convertvector(levels * known * square_x, F);
-            const I asks_itself = edge | (slope_x * slope_x + slope_y * slope_y > limit * limit) | (known < least_count);
-            float mean[LANES];
-            store(mean, pick(asks_itself, F(-1.0f), arrived / ((float)levels * brought)));
-            for (int l = 0; l < LANES && from + l < asks; ++l) out[from + l] = mean[l];
         }
+        const I spread = total * (levels * known - total), between = known * squares - total * total;
+        const I edge = (sharp * between > spread) & (least_spread * spread > levels * levels * known * known);
+        const F slope_x = __builtin_convertvector(known * along_x - total * sum_x, F);
+        const F slope_y = __builtin_convertvector(known * along_y - total * sum_y, F);
+        const F limit = steep * __builtin_convertvector(levels * known * square_x, F);
+        const I asks_itself = edge | (slope_x * slope_x + slope_y * slope_y > limit * limit) | (known < least_count);
+        return pick(asks_itself, F(-1.0f), arrived / ((float)levels * brought));
     };
     const int first_light = to_sky ? SKY : only_first || sharing ? distant_count : 0;
     const int last_light = to_sky ? SKY : distant_count + area_count - 1;
@@ -240,73 +220,85 @@ CODES += [SAME_TURN, FLATNESS, LEAST_COUNT, SHARP, LEAST_SPREAD, STEEP]
         const bool distant = light >= 0 && light < distant_count;
         const int k = light - distant_count;
         const int known_count = distant ? 0 : known_samples, ray_count = distant ? 1 : samples;
-        const long pictured = light < distant_count ? 0 : k * (long)around.found.shape[1];
-        unsigned char* found = around.found.data + pictured;
-        unsigned char* shared = around.shared.data + pictured;
+        const long of_light = light < distant_count ? 0 : k * (long)around.found.shape[1];
+        unsigned char* found = around.found.data + of_light;
+        unsigned char* shared = around.shared.data + of_light;
+        const bool casts = to_sky || (distant ? cast_distant.data[light] : cast_areas.data[k]) != 0;
         // What would arrive unshadowed, `before`, and which points have to ask.
         int asking_count = 0;
-        for (int j = 0; j < end - begin; ++j) {
-            const float* from = rows + begin + j;
-            const float n_x = from[3 * stride], n_y = from[4 * stride], n_z = from[5 * stride];
-            share[j] = 1.0f;
-            bool asks;
+        for (int v = 0; v < GROUPS && begin + v * LANES < end; ++v) {
+            const int start = begin + v * LANES;
+            auto row = [&](int r) -> F { return load(rows + r * stride + start); };
+            const I there = start + lanes() < end;
+            I asks;
+            F of_what = F(1.0f), arrives = F(1.0f);
             if (to_sky) {
-                asks = n_x != 0.0f || n_y != 0.0f || n_z != 0.0f;
-            } else if (distant) {
-                const auto& to_light = lights.distant.data[light].to_light;
-                before[j] = n_x * to_light[0] + n_y * to_light[1] + n_z * to_light[2];
-                asks = before[j] > 0.0f && cast_distant.data[light] != 0;
+                asks = there & ((row(3) != 0.0f) | (row(4) != 0.0f) | (row(5) != 0.0f));
             } else {
-                before[j] = starts.unshadowed.data[k * stride + begin + j];
-                asks = before[j] > 0.0f && cast_areas.data[k] != 0;
-                if (asks && sharing) {
-                    const int entry = found[place[j]];
-                    asks = found_around(found, place[j]) == (lit | dark);
-                    known[j] = (float)(entry >> 2) / (float)levels;
-                    if (!asks) shared[place[j]] = (unsigned char)entry;
-                } else if (asks && to_all) {
-                    const int entry = known_count > 0 ? shared[place[j]] : found_around(found, place[j]);
-                    const int together = entry & (lit | dark);
-                    asks = together == (lit | dark);
-                    if (together == dark) share[j] = 0.0f;
-                    known[j] = (float)(entry >> 2) / (float)levels;
+                if (distant) of_what = dot(V{row(3), row(4), row(5)}, spread(lights.distant.data[light].to_light));
+                else of_what = load(starts.unshadowed.data + k * stride + start);
+                asks = there & (of_what > 0.0f);
+                if (!casts) asks = I(0);
+                if (!distant && bits(asks) && (sharing || to_all)) {
+                    const bool by_first = sharing || known_count == 0;
+                    const Entries entry = entries(by_first ? found : shared, v, 0);
+                    const I together = by_first ? found_around(found, v) : numbers(entry) & (lit | dark);
+                    const I settled = asks & (together != (lit | dark));
+                    store(known + v * LANES, __builtin_convertvector(numbers(entry) >> 2, F) / (float)levels);
+                    asks &= ~settled;
+                    if (sharing && bits(settled)) {
+                        for (unsigned left = bits(settled); left != 0; left &= left - 1) {
+                            const int l = __builtin_ctz(left);
+                            shared[place[v * LANES + l]] = entry[l];
+                        }
+                    } else if (to_all) {
+                        arrives = pick(settled & (together == dark), F(0.0f), arrives);
+                        if (known_count > 0 && bits(asks)) {
+                            const F mean = shared_shares(shared, starts.unshadowed.data + k * stride, v, asks);
+                            const I told = asks & ~(mean < 0.0f);
+                            arrives = pick(told, mean, arrives);
+                            asks &= ~told;
+                        }
+                    }
                 }
             }
-            if (!asks) continue;
-            brought[j] = arrived[j] = 0.0f;
-            asking[asking_count++] = j;
+            store(before + v * LANES, of_what);
+            store(share + v * LANES, arrives);
+            for (unsigned left = bits(asks); left != 0; left &= left - 1)
+                asking[asking_count++] = v * LANES + __builtin_ctz(left);
         }
-        if (to_all && !distant && known_count > 0 && asking_count > 0) {
-            float mean[BLOCK];
-            shared_shares(shared, starts.unshadowed.data + k * stride, asking, asking_count, mean);
-            int left = 0;
-            for (int a = 0; a < asking_count; ++a) {
-                const int j = asking[a];
-                if (mean[a] < 0.0f) asking[left++] = j;
-                else share[j] = mean[a];
-            }
-            asking_count = left;
+        // The starts of those that ask, one after the other.
+        float start[11][2 * BLOCK], brought[2 * BLOCK], arrived[2 * BLOCK];
+        for (int v = 0; v * LANES < asking_count; ++v) {
+            const I own = begin + iload(asking + v * LANES);
+            const bool together = (v + 1) * LANES <= asking_count && own[LANES - 1] - own[0] == LANES - 1;
+            const I from = v * LANES + lanes() < asking_count ? own : I(begin + asking[0]);
+            for (int r = 0; r < 11; ++r)
+                store(start[r] + v * LANES, together ? load(rows + r * stride + own[0]) : gather(rows + r * stride, from));
+            store(brought + v * LANES, F(0.0f));
+            store(arrived + v * LANES, F(0.0f));
         }
         // Rays of a point lie side by side: they start at the same place.
         int point = 0, sample = known_count;
+        const bool each_once = ray_count == known_count + 1;
         while (point < asking_count && known_count < ray_count) {
-            int of[2 * LANES], which[2 * LANES], used = 0;
-            for (; used < 2 * LANES && point < asking_count; ++used) {
-                of[used] = asking[point];
+            int of[BLOCK], which[BLOCK], used = 0;
+            for (; used < BLOCK && point < asking_count; ++used) {
+                of[used] = point;
                 which[used] = sample;
                 if (++sample == ray_count) { sample = known_count; ++point; }
             }
-            for (int l = used; l < 2 * LANES; ++l) { of[l] = of[used - 1]; which[l] = which[used - 1]; }
-            V p[2], d[2];
-            F weight[2], reach[2];
-            I sent[2], met[2];
-            for (int g = 0; g < 2; ++g) {
+            for (int l = used; l < BLOCK; ++l) { of[l] = of[used - 1]; which[l] = which[used - 1]; }
+            V p[GROUPS], d[GROUPS];
+            F weight[GROUPS], reach[GROUPS];
+            I sent[GROUPS], met[GROUPS];
+            for (int g = 0; g < GROUPS; ++g) {
                 const I own = iload(of + g * LANES);
                 const F s = __builtin_convertvector(iload(which + g * LANES), F);
                 const bool alone = of[g * LANES] == of[(g + 1) * LANES - 1];
                 auto pull = [&](int r) -> F {
-                    const float* from = rows + r * stride + begin;
-                    return alone ? F(from[of[g * LANES]]) : gather(from, own);
+                    const float* from = start[r] + of[g * LANES];
+                    return alone ? F(from[0]) : each_once ? load(from) : gather(start[r], own);
                 };
                 p[g] = V{pull(0), pull(1), pull(2)};
                 sent[g] = g * LANES + lanes() < used;
@@ -338,20 +330,27 @@ CODES += [SAME_TURN, FLATNESS, LEAST_COUNT, SHARP, LEAST_SPREAD, STEEP]
                 weight[g] = ray.weight;
                 sent[g] &= outside(area, p[g]) & (ray.weight > 0.0f);
             }
-            is_met_by(sent, p, d, reach, met);
-            for (int g = 0; g < 2; ++g) {
-                const unsigned free = bits(sent[g] & ~met[g]);
-                for (unsigned left = bits(sent[g]); left != 0; left &= left - 1) {
-                    const int l = __builtin_ctz(left), j = of[g * LANES + l];
-                    brought[j] += weight[g][l];
-                    if (free >> l & 1) arrived[j] += weight[g][l];
+            find_blocked(sent, p, d, reach, met);
+            for (int g = 0; g * LANES < used; ++g) {
+                const I free = sent[g] & ~met[g];
+                if (each_once) {
+                    store(brought + of[g * LANES], pick(sent[g], weight[g], F(0.0f)));
+                    store(arrived + of[g * LANES], pick(free, weight[g], F(0.0f)));
+                    continue;
+                }
+                float brings[LANES], arrives[LANES];
+                store(brings, pick(sent[g], weight[g], F(0.0f)));
+                store(arrives, pick(free, weight[g], F(0.0f)));
+                for (int l = 0; l < LANES && g * LANES + l < used; ++l) {
+                    brought[of[g * LANES + l]] += brings[l];
+                    arrived[of[g * LANES + l]] += arrives[l];
                 }
             }
         }
         for (int a = 0; a < asking_count; ++a) {
             const int j = asking[a];
-            if (brought[j] != 0.0f) share[j] = arrived[j] / brought[j];
-            if (to_sky && brought[j] != 0.0f) out_share.data[begin + j] = share[j];
+            if (brought[a] != 0.0f) share[j] = arrived[a] / brought[a];
+            if (to_sky && brought[a] != 0.0f) out_share.data[begin + j] = share[j];
             if (known_count > 0)
                 share[j] = ((float)known_count * known[j] + (float)(ray_count - known_count) * share[j]) / (float)ray_count;
             if (only_first || sharing) {
@@ -367,19 +366,24 @@ CODES += [SAME_TURN, FLATNESS, LEAST_COUNT, SHARP, LEAST_SPREAD, STEEP]
             out_share.data[(begin + j) * (distant_count + area_count) + light] = share[j];
         }
         if (!to_all) continue;
-        const auto& color = distant ? lights.distant.data[light].irradiance : lights.areas.data[k].radiance;
-        for (int j = 0; j < end - begin; ++j) {
-            if (!(before[j] > 0.0f)) continue;
-            const float arrives = before[j] * share[j];
-            sum_x[j] += arrives * color[0];
-            sum_y[j] += arrives * color[1];
-            sum_z[j] += arrives * color[2];
+        const V color = spread(distant ? lights.distant.data[light].irradiance : lights.areas.data[k].radiance);
+        for (int v = 0; v < GROUPS && begin + v * LANES < end; ++v) {
+            const F of_what = load(before + v * LANES);
+            const V sum = add(total[v], times(of_what * load(share + v * LANES), color));
+            total[v] = vpick(of_what > 0.0f, sum, total[v]);
         }
     }
-    if (!to_all) return;
-    for (int j = 0; j < end - begin; ++j) {
-        float* to = (float*)(out_irradiance.data + begin + j);
-        to[0] = sum_x[j]; to[1] = sum_y[j]; to[2] = sum_z[j];
+    for (int v = 0; to_all && v < GROUPS && begin + v * LANES < end; ++v) {
+        float* to = (float*)out_irradiance.data;
+        const int start = begin + v * LANES;
+        if (start + LANES <= end) {
+            vstore(to, start, total[v]);
+            continue;
+        }
+        for (int l = 0; start + l < end; ++l) {
+            float* one = to + 3 * (start + l);
+            one[0] = total[v].x[l]; one[1] = total[v].y[l]; one[2] = total[v].z[l];
+        }
     }
 """
     )

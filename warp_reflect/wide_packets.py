@@ -28,27 +28,11 @@ TRAVERSAL = (
     const float* tree_chunks = (const float*)tree[2];
     typedef int RowMask __attribute__((ext_vector_type(8)));
     typedef bool RowBits __attribute__((ext_vector_type(8)));
-    typedef float Four __attribute__((ext_vector_type(4)));
     struct Chunk { enum { value = 4 }; };
     typedef int FourMask __attribute__((ext_vector_type(4)));
     const wp::Mesh& tree_mesh = *(const wp::Mesh*)tree[0];
     // Branches that are passed by: `WideTree.branches_of`, or none.
     const unsigned char* left_out = 0;
-    // The least or the most of a vector, half by half: the compiler's own reduction minds NaN, one lane after the other.
-    auto folded = [](F v, auto better) -> float {
-#if defined(__AVX512F__)
-        const Row eight = better(__builtin_shufflevector(v, v, 0, 1, 2, 3, 4, 5, 6, 7),
-            __builtin_shufflevector(v, v, 8, 9, 10, 11, 12, 13, 14, 15));
-#else
-        const Row eight = v;
-#endif
-        const Four four = better(__builtin_shufflevector(eight, eight, 0, 1, 2, 3),
-            __builtin_shufflevector(eight, eight, 4, 5, 6, 7));
-        const Four two = better(four, __builtin_shufflevector(four, four, 2, 3, 0, 1));
-        return better(two, __builtin_shufflevector(two, two, 1, 0, 3, 2))[0];
-    };
-    auto lesser = [](auto a, auto b) { return a < b ? a : b; };
-    auto larger = [](auto a, auto b) { return a > b ? a : b; };
     // GROUPS vectors of rays from `o` along `d`, lanes `live` of them, which meet what is nearer than `reach`. `nearest`: the
     // first of it; otherwise a lane is done with the first thing found, and only whether there is one is told (`face`).
     auto traverse = [&](auto nearest, auto groups, const I* live, const V* o, const V* d, const F* reach, Met* met) {
