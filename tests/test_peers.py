@@ -41,3 +41,34 @@ def test_psnr_is_of_the_displayed_pictures(peers):
     there[0] = True
     half[1:] = 0.0
     assert peers.psnr(half, black, there) == pytest.approx(20.0 * np.log10(2.0), abs=1e-4)
+
+
+def test_packets_of_embree_find_what_its_single_rays_find(peers):
+    import embree_packets
+
+    scene = wr.load_stage(ROOT / "usd_scenes" / "kitchen.usda")
+    frame = wr.render_frame(scene, wr.make_plan(scene, size=(97, 54), method="reference"))
+    wavefront = peers.Wavefront(scene, frame)
+    wavefront.trace()
+    if fault := embree_packets.built()[1]:  # without Embree's own headers there is none, and it says what is missing
+        with pytest.raises(RuntimeError, match=r"install Embree 3|no C[+][+] compiler"):
+            embree_packets.Packets(wavefront, threads=1)
+        assert fault
+        return
+    found = []
+    for threads in (1, 2):
+        packets = embree_packets.Packets(wavefront, threads)
+        packets.trace()
+        found.append(packets.triangle.copy())
+        packets.close()
+    np.testing.assert_array_equal(*found)
+    # Rounding differs: rays that pass an edge closely meet the other triangle of it.
+    assert (found[0][wavefront.pixel] == wavefront.hit).mean() > 0.99
+    assert (found[0] == embree_packets.NOTHING).sum() == pytest.approx(97 * 54 - len(wavefront.pixel), abs=20)
+
+
+def test_packets_say_that_no_compiler_was_found(peers, monkeypatch):
+    import embree_packets
+
+    monkeypatch.setattr(embree_packets.shutil, "which", lambda _name: None)
+    assert embree_packets.built.__wrapped__() == (None, "no C++ compiler was found")

@@ -40,6 +40,7 @@ import warp as wp
 
 sys.path.insert(0, str(Path(__file__).parent))
 from bench_frames import Embree, commit, machine
+from embree_packets import Packets
 
 SHADOW_SAMPLES = 64
 LIGHTING = ("none", "lights", "all")  # which lights' shadows Mitsuba casts
@@ -260,6 +261,15 @@ def times(stage: str, size: tuple[int, int], arguments, llvm: bool) -> list[dict
                     "embree wavefront", "embreex, eye rays, NumPy, mirror rays", wave.trace, wave.agreement, shadows=""
                 )
             )
+            try:
+                packets = Packets(wave, arguments.threads)
+                kind = "" if packets.native else ", of which this build has none for this processor"
+                what = f"Embree 3 from C++, eye and mirror rays in packets of 16{kind}"
+                contenders.append(
+                    Contender("embree packets", what, lambda: (None, packets.trace()), packets.agreement, shadows="")
+                )
+            except RuntimeError as fault:
+                print(f"embree packets: {fault}", file=sys.stderr)
         vtk = EnvironmentMap.over(scene, first) if mitsuba else None  # whose converter reads the scene
         if vtk:
             what = "one environment texture in PBR mirrors"
@@ -317,6 +327,12 @@ def package_contenders(scene, size, base, first) -> list[Contender]:
                 name, f"this package, {techniques}", run, identical, picture=lambda last=last: picture(last["frame"])
             )
         )
+
+    def hits(last=last):
+        spent = last["frame"].timings
+        return None, sum(ms for step, ms in spent.items() if "/" not in step and step != "shade")
+
+    contenders.append(Contender("auto, hits", "the same frame without its shading", hits, identical, shadows=""))
     return contenders
 
 
@@ -339,6 +355,11 @@ def mitsuba_contenders(
             rays = MitsubaRays(scene, first)
             what = f"{LLVM}, the mirror rays given"
             contenders.append(Contender("mitsuba hits", what, lambda: (rays.trace(), None), rays.agreement, shadows=""))
+            both = MitsubaWavefront(Wavefront(scene, first), rays.scene)
+            what = f"{LLVM}, eye and mirror rays in one kernel"
+            contenders.append(
+                Contender("mitsuba wavefront", what, lambda: (None, both.trace()), both.agreement, shadows="")
+            )
 
         def same_light():
             start = time.perf_counter()
@@ -419,6 +440,88 @@ class MitsubaRays:
         return self.embree.agreement(self.frame)
 
 
+class MitsubaWavefront:
+    """What `Wavefront` does, as one kernel of Dr.Jit on any number of threads: hits, no shading."""
+
+    def __init__(self, wavefront: Wavefront, scene):
+        import mitsuba as mi
+
+        source, camera = wavefront.source, wavefront.frame.camera
+        self.wavefront, self.scene, self.size = wavefront, scene, camera.size
+        self.step = 1.0e-4 * source.size
+
+        def table(rows, kind):
+            return kind(np.ascontiguousarray(rows).ravel())
+
+        patch = source.host_triangle_patch
+        self.mirror = table(np.where(wavefront.is_mirror[patch], patch, -1).astype(np.int32), mi.Int32)
+        self.points = table(source.host_points.astype(np.float32), mi.Float)
+        self.triangles = table(source.host_triangles.astype(np.int32), mi.Int32)
+        self.normals = table(source.host_normals.astype(np.float32), mi.Float)
+        self.normal_index = table(source.host_normal_index.astype(np.int32), mi.Int32)
+        # Of every patch: the unit frame of its quadric by rows, a, b, and whether it has one.
+        shapes = np.zeros((len(source.patch_shapes), 15), np.float32)
+        for k, unit_from_scene, shape in wavefront.curved:
+            shapes[k] = *unit_from_scene[:3].ravel(), shape.a, shape.b, 1.0
+        self.shapes = table(shapes, mi.Float)
+        # Opaque: a literal would be compiled into the kernel, which other cameras then could not use.
+        eye = camera.eye - source.origin
+        rows = eye, camera.forward, camera.right / camera.fx, camera.up / camera.fy
+        self.eye, self.forward, self.right, self.up = (mi.Vector3f(np.float32(row)) for row in rows)
+        self.centre = mi.Point2f(camera.cx, camera.cy)
+        self.orthographic = camera.orthographic
+
+    def trace(self) -> float:
+        """Milliseconds of both kinds of rays."""
+        import drjit as dr
+        import mitsuba as mi
+
+        start = time.perf_counter()
+        width, height = self.size
+        for each in (self.eye, self.forward, self.right, self.up, self.centre):
+            dr.make_opaque(each)
+        number = dr.arange(mi.UInt32, width * height)
+        x, y = mi.Float(number % width) + 0.5 - self.centre.x, self.centre.y - mi.Float(number // width) - 0.5
+        aside = x * self.right + y * self.up
+        if self.orthographic:
+            ray = mi.Ray3f(mi.Point3f(self.eye + aside), self.forward)
+        else:
+            ray = mi.Ray3f(mi.Point3f(self.eye), dr.normalize(self.forward + aside))
+        seen = self.scene.ray_intersect_preliminary(ray)
+        patch = dr.gather(mi.Int32, self.mirror, seen.prim_index, seen.is_valid())
+        mirrored = seen.is_valid() & (patch >= 0)
+
+        def three(array, row, kind=mi.Vector3f):
+            return dr.gather(kind, array, row, mirrored)
+
+        corner = three(self.triangles, seen.prim_index, mi.Vector3i)
+        index = three(self.normal_index, seen.prim_index, mi.Vector3i)
+        u, v = seen.prim_uv
+        w = 1.0 - u - v
+        a, b, c = (three(self.points, mi.UInt32(k)) for k in corner)
+        point = w * a + u * b + v * c
+        smooth = mirrored & (index.x >= 0)
+        r = [dr.gather(mi.Vector3f, self.normals, mi.UInt32(k), smooth) for k in index]
+        normal = dr.select(smooth, w * r[0] + u * r[1] + v * r[2], dr.cross(b - a, c - a))
+        m = [dr.gather(mi.Float, self.shapes, mi.UInt32(15 * patch + k), mirrored) for k in range(15)]
+        q = [m[4 * k] * point.x + m[4 * k + 1] * point.y + m[4 * k + 2] * point.z + m[4 * k + 3] for k in range(3)]
+        gradient = q[0], q[1], m[12] * q[2] + 0.5 * m[13]
+        curved = mi.Vector3f(*(m[k] * gradient[0] + m[4 + k] * gradient[1] + m[8 + k] * gradient[2] for k in range(3)))
+        normal = dr.normalize(dr.select(m[14] > 0.0, curved, normal))
+        cosine = dr.dot(normal, ray.d)
+        onward = mi.Ray3f(mi.Point3f(point - dr.sign(cosine) * self.step * normal), ray.d - 2.0 * cosine * normal)
+        found = self.scene.ray_intersect_preliminary(onward, active=mirrored)
+        triangle = dr.select(mirrored, dr.select(found.is_valid(), mi.Int32(found.prim_index), -1), -2)
+        dr.eval(triangle)
+        dr.sync_thread()
+        spent = 1000.0 * (time.perf_counter() - start)
+        self.triangle = np.array(triangle)
+        return spent
+
+    def agreement(self) -> float:
+        return self.wavefront.share(self.triangle)
+
+
 class Wavefront:
     """A frame's eye rays and mirror rays through embreex, with NumPy between them: hits, no shading."""
 
@@ -490,6 +593,10 @@ class Wavefront:
         nothing = -2
         found = np.full(len(self.origins), nothing, np.int64)
         found[self.pixel] = self.hit
+        return self.share(found)
+
+    def share(self, found: np.ndarray) -> float:
+        """The same of others' triangles, one of every pixel of the picture."""
         same = [found[layer.pixels.pixel.numpy()] == layer.triangle.numpy() for layer in self.frame.layers.values()]
         return float(np.concatenate(same).mean())
 
