@@ -454,7 +454,8 @@ def cut_where_bent(
     for _ in range(virtual_mesh.RELAX_STEPS):
         allowed_px = settings.edge_px * relaxed / virtual_mesh.CUT_SLACK
         upper = estimated[ids] if relaxed == 1.0 else cuts_for(relaxed / virtual_mesh.CUT_SLACK)[ids]
-        cuts[ids] = virtual_mesh.measured_cuts(scene, ids, upper, vertices, middles, allowed_px, unit_per_scene)
+        ask = scene, ids, upper, vertices, middles, allowed_px, unit_per_scene
+        cuts[ids] = virtual_mesh.measured_cuts(*ask, settings.threads)
         if virtual_mesh.triangle_cost(cuts) <= virtual_mesh.budget(scene):
             break
         relaxed *= virtual_mesh.RELAX

@@ -27,7 +27,8 @@ HIDDEN = wp.constant(int(Status.HIDDEN))
 UNREFLECTED = wp.constant(int(Status.UNREFLECTED))
 DROPPED = raster.DROPPED
 CUT_MAX = wp.constant(32)  # pieces along an edge; a lattice of 32 has 1024 triangles
-STRADDLING_MAX = 4  # pieces of a triangle that is partly hidden: the estimate grows without bound at grazing incidence
+# Pieces of a triangle that is partly hidden: the estimate grows without bound at grazing incidence.
+STRADDLING_MAX = wp.constant(4)
 CUT_SLACK = 1.5  # the tolerance is divided by it when cutting, so that a moving eye does not cut anew every frame
 # Of the triangles that are cut: as many may want more pieces before everything is cut anew for a moving eye. The estimate
 # of a triangle at the hidden boundary grows without bound, and there are always some.
@@ -36,7 +37,8 @@ BUDGET_SHARE = 2.0  # new triangles per triangle of the scene (beside BUDGET_MIN
 BUDGET_MIN = 20000
 RELAX = 2.0  # factor of the tolerance per attempt to meet the budget
 RELAX_STEPS = 24  # 2^23 times the tolerance cuts nothing any more
-MEASURED_LENGTH = 2.0  # of a mirror's radius: the deviation of longer pieces says nothing about that of shorter ones
+# Of a mirror's radius: the deviation of longer pieces says nothing about that of shorter ones.
+MEASURED_LENGTH = wp.constant(2.0)
 GONE_LANES = 64  # threads of a device for each box whose vertices are settled together
 # Of the mirror's radius: longer pieces of a partly hidden triangle end in a straight line where the border of what is hidden
 # is curved, and what lies between is not drawn. Such triangles are asked for at every pixel (`refine.settle`).
@@ -334,6 +336,50 @@ def settle_gone(
     return gone
 
 
+@wp.kernel
+def measure_kernel(
+    first: int,
+    triangles: wp.array(dtype=wp.vec3i),
+    points: wp.array(dtype=wp.vec3),
+    ids: wp.array(dtype=int),
+    estimate: wp.array(dtype=wp.uint8),
+    screen: wp.array(dtype=wp.vec4),
+    middle: wp.array(dtype=wp.vec4),
+    tolerance_px: float,
+    unit_per_scene: float,
+    out_cut: wp.array(dtype=wp.uint8),
+):
+    """One thread per asked triangle, see `measured_cuts`."""
+    i = first + wp.tid()
+    t = triangles[ids[i]]
+    longest = float(0.0)
+    deviation = float(0.0)
+    seen = int(1)
+    for k in range(3):
+        a = t[k]
+        b = t[(k + 1) % 3]
+        longest = wp.max(longest, wp.length(points[b] - points[a]))
+        start = screen[a]
+        end = screen[b]
+        between = middle[k * ids.shape[0] + i]
+        along_x = end[0] - start[0]
+        along_y = end[1] - start[1]
+        off = wp.abs(along_x * (between[1] - start[1]) - along_y * (between[0] - start[0]))
+        deviation = wp.max(deviation, off / wp.max(wp.sqrt(along_x * along_x + along_y * along_y), 1.0))
+        if start[2] <= 0.0 or between[2] <= 0.0:
+            seen = 0
+    most = int(estimate[i])
+    pieces = int(1)
+    if seen == 0:
+        pieces = wp.min(STRADDLING_MAX, most)
+    else:
+        wanted = wp.max(wp.sqrt(wp.max(deviation / tolerance_px, 1.0)), longest * unit_per_scene / MEASURED_LENGTH)
+        # `most` is a power of two, too.
+        while pieces < most and float(pieces) < wanted:
+            pieces = pieces * 2
+    out_cut[i] = wp.uint8(pieces)
+
+
 def whole(scene: Scene, part: PartRange) -> VirtualMesh:
     """The scene without the mirror, nothing cut."""
     ones = np.ones(scene.triangle_count, np.uint8)
@@ -354,6 +400,7 @@ def measured_cuts(
     middles,
     tolerance_px: float,
     unit_per_scene: float,
+    threads: int,
 ) -> np.ndarray:
     """Pieces per triangle from how far the picture of each edge's middle lies off the straight edge.
 
@@ -368,21 +415,11 @@ def measured_cuts(
         tolerance_px: Deviation allowed. [pixels]
         unit_per_scene: Of the mirror's unit frame, in which it is about 1 in radius.
     """
-    longest = _longest_edges(scene, ids) * unit_per_scene
-    screen, middle = vertices.screen.numpy(), middles.screen.numpy().reshape(3, len(ids), 4)
-    corner = [screen[each] for each in scene.host_triangles[ids].T]
-    seen, deviation = np.ones(len(ids), bool), np.zeros(len(ids))
-    for k in range(3):
-        # Edge by edge and coordinate by coordinate: sums and maxima over axes of three are slow.
-        start, end, between = corner[k].astype(np.float64), corner[(k + 1) % 3], middle[k]
-        along_x, along_y = end[:, 0] - start[:, 0], end[:, 1] - start[:, 1]
-        off_x, off_y = between[:, 0] - start[:, 0], between[:, 1] - start[:, 1]
-        length = np.maximum(np.sqrt(along_x * along_x + along_y * along_y), 1.0)
-        deviation = np.maximum(deviation, np.abs(along_x * off_y - along_y * off_x) / length)
-        seen &= (start[:, 2] > 0.0) & (between[:, 2] > 0.0)
-    wanted = np.sqrt(np.maximum(deviation / tolerance_px, 1.0))
-    pieces = 2.0 ** np.ceil(np.log2(np.maximum(wanted, longest / MEASURED_LENGTH)))
-    return np.minimum(np.where(seen, pieces, STRADDLING_MAX), estimate).astype(np.uint8)
+    device, measured = scene.device, wp.empty(len(ids), dtype=wp.uint8, device=scene.device)
+    inputs = [scene.view.triangles, scene.view.points, wp.array(ids.astype(np.int32), dtype=int, device=device)]
+    inputs += [wp.array(estimate, dtype=wp.uint8, device=device), vertices.screen, middles.screen]
+    launch(measure_kernel, len(ids), [*inputs, tolerance_px, unit_per_scene, measured], device, threads)
+    return measured.numpy()
 
 
 def coarse_triangles(
@@ -443,29 +480,33 @@ def cut_mesh(scene: Scene, part: PartRange, cuts: np.ndarray, estimated: np.ndar
         dropped |= ~seen
     cuts = np.where(dropped, 1, cuts)
     kept = (cuts == 1) & ~dropped
-    points, triangles, parents = [scene.host_points], [scene.host_triangles[kept]], [np.flatnonzero(kept)]
+    points, triangles = [scene.host_points], [scene.host_triangles[kept]]
+    parents = [np.flatnonzero(kept).astype(np.int32)]
     added, places = [np.zeros(0, np.int32)], [np.zeros((0, 2), np.float32)]
     count = scene.vertex_count
     for pieces in np.unique(cuts[cuts > 1]):
-        ids = np.flatnonzero(cuts == pieces)
+        ids = np.flatnonzero(cuts == pieces).astype(np.int32)
         weights, lattice = lattice_of(int(pieces))
         corner = scene.host_points[scene.host_triangles[ids]]
         lattice_points = corner.transpose(0, 2, 1).reshape(-1, 3) @ weights.T
         points.append(lattice_points.reshape(len(ids), 3, -1).transpose(0, 2, 1).reshape(-1, 3).astype(np.float32))
-        first = count + np.arange(len(ids)) * len(weights)
-        triangles.append((lattice[None] + first[:, None, None]).reshape(-1, 3))
+        first = np.arange(count, count + len(ids) * len(weights), len(weights), dtype=np.int32)
+        triangles.append((lattice[None].astype(np.int32) + first[:, None, None]).reshape(-1, 3))
         parents.append(np.repeat(ids, len(lattice)))
-        added.append(np.repeat(ids.astype(np.int32), len(weights)))
+        added.append(np.repeat(ids, len(weights)))
         places.append(np.tile(weights[:, 1:].astype(np.float32), (len(ids), 1)))
         count += len(ids) * len(weights)
-    host_triangles = np.concatenate(triangles).astype(np.int32)
-    host_parents = np.concatenate(parents).astype(np.int32)
-    device = scene.device
+    host_triangles = np.concatenate(triangles).astype(np.int32, copy=False)
+    host_parents = np.concatenate(parents)
+
+    def on_device(values: np.ndarray, kind) -> wp.array:
+        return wp.array(values, dtype=kind, device=scene.device, copy=False)  # nobody writes to them
+
     return VirtualMesh(
-        wp.array(np.concatenate(points), dtype=wp.vec3, device=device),
-        wp.array(host_triangles, dtype=wp.vec3i, device=device),
-        wp.array(host_parents, dtype=int, device=device),
-        wp.array(scene.host_triangle_patch[host_parents], dtype=int, device=device),
+        on_device(np.concatenate(points), wp.vec3),
+        on_device(host_triangles, wp.vec3i),
+        on_device(host_parents, int),
+        on_device(scene.host_triangle_patch[host_parents], int),
         host_triangles,
         host_parents,
         scene.vertex_count,
@@ -591,7 +632,9 @@ def start_added(
     """
     device = scene.device
     inputs = [scene.view.triangles, wp.array(ids.astype(np.int32), dtype=int, device=device)]
-    inputs.append(wp.array(np.searchsorted(ids, mesh.added_triangle).astype(np.int32), dtype=int, device=device))
+    slot = np.zeros(scene.triangle_count, np.int32)
+    slot[ids] = np.arange(len(ids), dtype=np.int32)
+    inputs.append(wp.array(slot[mesh.added_triangle], dtype=int, device=device))
     inputs += [wp.array(mesh.added_place, dtype=wp.vec2, device=device), vertices, middles, out_added]
     launch(start_added_kernel, len(mesh.added_triangle), inputs, device, threads)
 
