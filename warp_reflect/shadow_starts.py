@@ -8,6 +8,9 @@ Warfare, SIGGRAPH 2014).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import warp as wp
 
 from warp_reflect import compact, vector
@@ -25,6 +28,8 @@ LEAST_SQUARE = wp.constant(1.0e-30)  # keeps quotients finite
 # 1 / g and 1 / g^2 of g^3 = g + 1.
 R2_X = wp.constant(0.7548776662466927)
 R2_Y = wp.constant(0.5698402909980532)
+PLACE_ROWS = 3  # behind the others: the points themselves, where something still asks for them
+ROOM = "room for shadow starts", None  # of `Scene.facts`
 
 
 @wp.struct
@@ -170,6 +175,33 @@ def row_vector(rows: wp.array2d(dtype=float), row: int, i: int) -> wp.vec3:
     return wp.vec3(rows[row, i], rows[row + 1, i], rows[row + 2, i])
 
 
+@contextmanager
+def kept_room(scene: Scene, count: int) -> Iterator[wp.array | None]:
+    """Memory for the rows of so many points, which the scene keeps for the next ones; None on CUDA, which has a pool for it.
+
+    Memory of this size is given back to a CPU's system at once, and touching as much anew costs more than filling it.
+    """
+    if scene.device.is_cuda:
+        yield None
+        return
+    words = (int(ROWS) + PLACE_ROWS) * vector.BLOCK * vector.block_count(count)
+    # Taken out, as another thread may render the same scene.
+    room = scene.facts.pop(ROOM, None)
+    if room is None or len(room) < words:
+        room = wp.empty(words, dtype=float, device=scene.device)
+    try:
+        yield room
+    finally:
+        scene.facts[ROOM] = room
+
+
+def rows_in(room: wp.array | None, rows: int, padded: int, device) -> wp.array:
+    """Rows of `padded` numbers, in a room or, without one, anew."""
+    if room is None:
+        return wp.empty((rows, padded), dtype=float, device=device)
+    return room[: rows * padded].reshape((rows, padded))
+
+
 def starts_of(
     scene: Scene,
     points: Points,
@@ -178,6 +210,7 @@ def starts_of(
     threads: int = 0,
     numbered: bool = False,
     kernels: str = "auto",
+    room: wp.array | None = None,
 ) -> Starts:
     """Where the shadow rays of points start.
 
@@ -189,19 +222,20 @@ def starts_of(
         threads: CPU threads; 0: one per core.
         numbered: Samples are shifted by the points' numbers, as for points of no image.
         kernels: `Settings.kernels`.
+        room: From `kept_room`, where the rows lie as long as it is; None: they have memory of their own.
     """
     device, count = scene.device, len(points.triangle)
     if normals is None:
         normals = compact.none(wp.vec3, device)
     starts = Starts()
     padded = vector.BLOCK * vector.block_count(count)
-    starts.rows = wp.empty((ROWS, padded), dtype=float, device=device)
+    starts.rows = rows_in(room, int(ROWS), padded, device)
     starts.unshadowed = wp.empty((area_count, padded), dtype=float, device=device)
     width = 0 if numbered else points.width
     if vector.chosen(kernels, device):
         from warp_reflect import shadow_starts_vector  # which fills this module's rows
 
-        shadow_starts_vector.starts_of(scene, points, normals, starts, width, threads)
+        shadow_starts_vector.starts_of(scene, points, normals, starts, width, threads, room)
         return starts
     at = [points.triangle, points.u, points.v, points.direction, normals, points.pixel, width]
     launch(starts_kernel, count, [scene.view, scene.lights.direct, *at, starts], device, threads)

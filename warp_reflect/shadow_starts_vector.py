@@ -16,7 +16,7 @@ from warp_reflect.launch import launch, module_part
 from warp_reflect.layers import CameraView
 from warp_reflect.ray_walk import FLOAT_EPS, OFFSET_ULPS
 from warp_reflect.scene import SHAPE_QUADRIC, Scene, SceneView
-from warp_reflect.shadow_starts import ROWS, Starts, row_vector
+from warp_reflect.shadow_starts import PLACE_ROWS, ROWS, Starts, row_vector, rows_in
 
 wp.set_module_options({"enable_backward": False})
 FLAT = module_part(__name__, "flat")
@@ -210,14 +210,22 @@ def flat_irradiance_kernel(
             out_unshadowed[k, i] = area_irradiance(lights.areas[k], p, n)
 
 
-def starts_of(scene: Scene, points: Points, normals: wp.array, starts: Starts, width: int, threads: int) -> None:
+def starts_of(
+    scene: Scene,
+    points: Points,
+    normals: wp.array,
+    starts: Starts,
+    width: int,
+    threads: int,
+    room: wp.array | None = None,
+) -> None:
     """What `shadow_starts.starts_kernel` does; see `shadow_starts.starts_of`."""
     device, count = scene.device, len(points.triangle)
     lights, rows, flat = scene.lights.direct, starts.rows, False
     if len(starts.unshadowed):
         flat = bool((lights.areas.numpy()["kind"] != SPHERE).any())
     if flat:
-        rows = wp.empty((ROWS + 3, rows.shape[1]), dtype=float, device=device)
+        rows = rows_in(room, int(ROWS) + PLACE_ROWS, rows.shape[1], device)
         starts.rows = rows
     camera = CameraView() if points.camera is None else points.camera
     at = [points.triangle, points.u, points.v, points.direction, normals, points.pixel, width]

@@ -43,7 +43,7 @@ from warp_reflect.shadow_neighbours import (
     share_of,
     shared_share,
 )
-from warp_reflect.shadow_starts import LEAST_SQUARE, RayStart, Starts, row_vector, sample_place, starts_of
+from warp_reflect.shadow_starts import LEAST_SQUARE, RayStart, Starts, kept_room, row_vector, sample_place, starts_of
 from warp_reflect.shapes import unit
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": launch.FINITE_FLAGS})
@@ -447,7 +447,6 @@ def shadowed_irradiance(
         inputs = [mesh, scene.view, lights, distant, areas, *at, cast.samples]
         cut_shadows.cut_irradiance(inputs, result, threads)
         return result
-    starts = starts_of(scene, points, normals, len(areas), threads, kernels=kernels)
     around = neighbours_of(points, len(areas) if any(cast.areas) else 0, cast.shared, threads)
     samples = first_count(cast.samples), shared_count(cast.samples) if cast.shared else 0, cast.samples
     send = _irradiance
@@ -455,7 +454,9 @@ def shadowed_irradiance(
         from warp_reflect import shadows_vector  # which sends this module's rays
 
         send, mesh = shadows_vector.irradiance, wp.uint64(scene.shadow_tracer.packets)
-    send(mesh, lights, [distant, areas], starts, count, samples, around, result, threads)
+    with kept_room(scene, count) as room:
+        starts = starts_of(scene, points, normals, len(areas), threads, kernels=kernels, room=room)
+        send(mesh, lights, [distant, areas], starts, count, samples, around, result, threads)
     return result
 
 
@@ -503,14 +504,15 @@ def sky_share(
         at = [*_arrays(points, normals, device), points.pixel, points.width]
         cut_shadows.cut_sky_share([mesh, scene.view, *at, samples], result, threads)
         return result
-    starts = starts_of(scene, points, normals, 0, threads, kernels=kernels)
-    if vector.chosen(kernels, device):
-        from warp_reflect import shadows_vector
+    with kept_room(scene, count) as room:
+        starts = starts_of(scene, points, normals, 0, threads, kernels=kernels, room=room)
+        if vector.chosen(kernels, device):
+            from warp_reflect import shadows_vector
 
-        shadows_vector.sky_share(wp.uint64(scene.shadow_tracer.packets), starts, count, samples, result, threads)
-        return result
-    inputs = [mesh, starts, samples, result]
-    launch.launch(sky_share_kernel, count, inputs, device, threads, split_min=TRACE_SPLIT_MIN)
+            shadows_vector.sky_share(wp.uint64(scene.shadow_tracer.packets), starts, count, samples, result, threads)
+            return result
+        inputs = [mesh, starts, samples, result]
+        launch.launch(sky_share_kernel, count, inputs, device, threads, split_min=TRACE_SPLIT_MIN)
     return result
 
 

@@ -29,21 +29,35 @@ from warp_reflect.shadow_starts import Starts
 
 wp.set_module_options({"enable_backward": False})
 
+# Blocks of pictures of whole multiples of so many pixels, and of half as many rows, are tiles a vector wide: as many as there
+# are blocks of one row, whether a vector has 16 lanes and four of them make a block, or 8 and eight do.
+TILE = 16
 BLOCK_SPLIT_MIN = 8  # blocks; what `bvh.TRACE_SPLIT_MIN` rays are
 # What `send_blocks_kernel` does.
 FIRST, SHARED, ALL, EACH, SKY = 0, 1, 2, 3, 4
 CODES = [FIRST, SHARED, EACH, SKY, SPHERE, CYLINDER, DARK, LIT, LEVELS, NEIGHBOURS]
-CODES += [SAME_TURN, FLATNESS, LEAST_COUNT, SHARP, LEAST_SPREAD, STEEP]
+CODES += [SAME_TURN, FLATNESS, LEAST_COUNT, SHARP, LEAST_SPREAD, STEEP, TILE]
 
 
 @wp.func_native(
     vector.snippet(
         ANY_HIT
         + r"""
-    const int begin = block * BLOCK;
-    const int end = begin + BLOCK < count ? begin + BLOCK : count;
+    // The first points of a block's vectors: in a picture of whole tiles they lie below each other, not in a row.
+    const int image_width = around.width;
+    const bool tiled = around.pixel.shape[0] == 0 && image_width > 0 && image_width % tile == 0
+        && count % image_width == 0 && count / image_width % (tile / 2) == 0;
+    int first_of[BLOCK / LANES];
+    for (int v = 0; v < BLOCK / LANES; ++v) {
+        const int across = tiled ? image_width / LANES : 1;
+        first_of[v] = block * BLOCK + v * LANES;
+        if (tiled) first_of[v] = (block / across * (BLOCK / LANES) + v) * image_width + block % across * LANES;
+    }
+    const int end = count;
     const float* rows = starts.rows.data;
     const int stride = starts.rows.shape[1];
+    auto point_of = [&](int j) -> int { return first_of[j / LANES] + j % LANES; };
+    auto points_of = [&](I j) -> I { return igather(first_of, j / LANES) + j % LANES; };
     auto root = [](F a) -> F { return __builtin_elementwise_sqrt(a); };
     auto below = [](F a) -> F { return a - __builtin_elementwise_floor(a); };
     // shadows.sample_place
@@ -140,7 +154,7 @@ CODES += [SAME_TURN, FLATNESS, LEAST_COUNT, SHARP, LEAST_SPREAD, STEEP]
     int number[BLOCK], place[BLOCK];
     bool straight[GROUPS];
     for (int v = 0; pictured && v < GROUPS; ++v) {
-        const int start = begin + v * LANES;
+        const int start = first_of[v];
         if (start >= end) break;
         const I own = start + lanes() < end ? start + lanes() : I(end - 1);
         const I pixel = listed ? igather(around.pixel.data, own) : own;
@@ -166,7 +180,7 @@ CODES += [SAME_TURN, FLATNESS, LEAST_COUNT, SHARP, LEAST_SPREAD, STEEP]
     };
     // shadow_neighbours.shared_share of a vector of points, lanes `asked` of it.
     auto shared_shares = [&](const unsigned char* shared, const float* unshadowed, int v, I asked) -> F {
-        const int start = begin + v * LANES;
+        const int start = first_of[v];
         auto own_row = [&](int r) -> F { return load(rows + r * stride + start); };
         const V p = V{own_row(0), own_row(1), own_row(2)}, side = V{own_row(6), own_row(7), own_row(8)};
         const I here = start + lanes(), pixel = iload(number + v * LANES);
@@ -226,8 +240,8 @@ CODES += [SAME_TURN, FLATNESS, LEAST_COUNT, SHARP, LEAST_SPREAD, STEEP]
         const bool casts = to_sky || (distant ? cast_distant.data[light] : cast_areas.data[k]) != 0;
         // What would arrive unshadowed, `before`, and which points have to ask.
         int asking_count = 0;
-        for (int v = 0; v < GROUPS && begin + v * LANES < end; ++v) {
-            const int start = begin + v * LANES;
+        for (int v = 0; v < GROUPS && first_of[v] < end; ++v) {
+            const int start = first_of[v];
             auto row = [&](int r) -> F { return load(rows + r * stride + start); };
             const I there = start + lanes() < end;
             I asks;
@@ -270,11 +284,11 @@ CODES += [SAME_TURN, FLATNESS, LEAST_COUNT, SHARP, LEAST_SPREAD, STEEP]
         // The starts of those that ask, one after the other.
         float start[11][2 * BLOCK], brought[2 * BLOCK], arrived[2 * BLOCK];
         for (int v = 0; v * LANES < asking_count; ++v) {
-            const I own = begin + iload(asking + v * LANES);
+            const I asked = v * LANES + lanes() < asking_count ? iload(asking + v * LANES) : I(asking[0]);
+            const I own = points_of(asked);
             const bool together = (v + 1) * LANES <= asking_count && own[LANES - 1] - own[0] == LANES - 1;
-            const I from = v * LANES + lanes() < asking_count ? own : I(begin + asking[0]);
             for (int r = 0; r < 11; ++r)
-                store(start[r] + v * LANES, together ? load(rows + r * stride + own[0]) : gather(rows + r * stride, from));
+                store(start[r] + v * LANES, together ? load(rows + r * stride + own[0]) : gather(rows + r * stride, own));
             store(brought + v * LANES, F(0.0f));
             store(arrived + v * LANES, F(0.0f));
         }
@@ -350,7 +364,7 @@ CODES += [SAME_TURN, FLATNESS, LEAST_COUNT, SHARP, LEAST_SPREAD, STEEP]
         for (int a = 0; a < asking_count; ++a) {
             const int j = asking[a];
             if (brought[a] != 0.0f) share[j] = arrived[a] / brought[a];
-            if (to_sky && brought[a] != 0.0f) out_share.data[begin + j] = share[j];
+            if (to_sky && brought[a] != 0.0f) out_share.data[point_of(j)] = share[j];
             if (known_count > 0)
                 share[j] = ((float)known_count * known[j] + (float)(ray_count - known_count) * share[j]) / (float)ray_count;
             if (only_first || sharing) {
@@ -360,22 +374,22 @@ CODES += [SAME_TURN, FLATNESS, LEAST_COUNT, SHARP, LEAST_SPREAD, STEEP]
                 else shared[place[j]] = (unsigned char)(entry | lit | dark);
             }
         }
-        for (int j = 0; each && j < end - begin; ++j) {
-            const float* n = rows + 3 * stride + begin + j;
+        for (int j = 0; each && j < BLOCK && point_of(j) < end; ++j) {
+            const float* n = rows + 3 * stride + point_of(j);
             if (n[0] == 0.0f && n[stride] == 0.0f && n[2 * stride] == 0.0f) continue;
-            out_share.data[(begin + j) * (distant_count + area_count) + light] = share[j];
+            out_share.data[point_of(j) * (distant_count + area_count) + light] = share[j];
         }
         if (!to_all) continue;
         const V color = spread(distant ? lights.distant.data[light].irradiance : lights.areas.data[k].radiance);
-        for (int v = 0; v < GROUPS && begin + v * LANES < end; ++v) {
+        for (int v = 0; v < GROUPS && first_of[v] < end; ++v) {
             const F of_what = load(before + v * LANES);
             const V sum = add(total[v], times(of_what * load(share + v * LANES), color));
             total[v] = vpick(of_what > 0.0f, sum, total[v]);
         }
     }
-    for (int v = 0; to_all && v < GROUPS && begin + v * LANES < end; ++v) {
+    for (int v = 0; to_all && v < GROUPS && first_of[v] < end; ++v) {
         float* to = (float*)out_irradiance.data;
-        const int start = begin + v * LANES;
+        const int start = first_of[v];
         if (start + LANES <= end) {
             vstore(to, start, total[v]);
             continue;
@@ -416,6 +430,7 @@ def send_block(
     sharp: int,
     least_spread: int,
     steep: float,
+    tile: int,
     out_irradiance: wp.array(dtype=wp.vec3),
     out_share: wp.array(dtype=float),
 ): ...
@@ -450,6 +465,7 @@ def send_blocks_kernel(
     sharp: int,
     least_spread: int,
     steep: float,
+    tile: int,
     # Outputs:
     out_irradiance: wp.array(dtype=wp.vec3),
     out_share: wp.array(dtype=float),
@@ -483,6 +499,7 @@ def send_blocks_kernel(
         sharp,
         least_spread,
         steep,
+        tile,
         out_irradiance,
         out_share,
     )
