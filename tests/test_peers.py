@@ -72,3 +72,21 @@ def test_packets_say_that_no_compiler_was_found(peers, monkeypatch):
 
     monkeypatch.setattr(embree_packets.shutil, "which", lambda _name: None)
     assert embree_packets.built.__wrapped__() == (None, "no C++ compiler was found")
+
+
+def test_what_moves_is_drawn_as_if_laid_out_anew(peers):
+    import bench_moving
+
+    kitchen = wr.load_stage(ROOT / "usd_scenes" / "kitchen.usda")
+    scene = bench_moving.movable(kitchen, "/World/Table")
+    moving = {each.prim_path.split("/")[2] for each in scene.data.instances if each.moves}
+    assert moving == {"Table"}
+    later = bench_moving.lifted(scene, 0.01 * scene.size)
+    assert later.host_triangles is scene.host_triangles
+    anew = wr.Scene(later.source_data)
+    np.testing.assert_array_equal(later.host_points, anew.host_points)
+    assert np.ptp(later.host_points - scene.host_points, axis=0) == pytest.approx(
+        [0.0, 0.01 * scene.size, 0.0], rel=1e-3
+    )
+    pictures = [wr.render_frame(each, wr.make_plan(each, size=(64, 36)))["RGBA"] for each in (later, anew)]
+    np.testing.assert_array_equal(*pictures)

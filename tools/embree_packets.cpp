@@ -128,6 +128,8 @@ void packet(const Peer& peer, const Camera& camera, int first_x, int first_y, fl
 
 extern "C" {
 
+void peer_build(Peer* peer);
+
 Peer* peer_open(const float* points, int point_count, const int* triangles, int triangle_count, const float* normals,
                 int normal_count, const int* normal_index, const int* patch, const Quadric* quadrics, int quadric_count,
                 const int* quadric_of_patch, int patch_count) {
@@ -140,17 +142,25 @@ Peer* peer_open(const float* points, int point_count, const int* triangles, int 
     peer->quadrics.assign(quadrics, quadrics + quadric_count);
     peer->quadric_of_patch.assign(quadric_of_patch, quadric_of_patch + patch_count);
     peer->device = rtcNewDevice(nullptr);
+    peer->scene = nullptr;
+    peer_build(peer);
+    return peer;
+}
+
+// The tree, from where the points are.
+void peer_build(Peer* peer) {
+    if (peer->scene) rtcReleaseScene(peer->scene);
+    const size_t point_count = peer->points.size() / 3, triangle_count = peer->triangles.size() / 3;
     peer->scene = rtcNewScene(peer->device);
     RTCGeometry geometry = rtcNewGeometry(peer->device, RTC_GEOMETRY_TYPE_TRIANGLE);
-    std::memcpy(rtcSetNewGeometryBuffer(geometry, RTC_BUFFER_TYPE_VERTEX, 0, RTC_FORMAT_FLOAT3, 12, point_count), points,
-                sizeof(float) * 3 * point_count);
-    std::memcpy(rtcSetNewGeometryBuffer(geometry, RTC_BUFFER_TYPE_INDEX, 0, RTC_FORMAT_UINT3, 12, triangle_count), triangles,
-                sizeof(int) * 3 * triangle_count);
+    std::memcpy(rtcSetNewGeometryBuffer(geometry, RTC_BUFFER_TYPE_VERTEX, 0, RTC_FORMAT_FLOAT3, 12, point_count),
+                peer->points.data(), sizeof(float) * 3 * point_count);
+    std::memcpy(rtcSetNewGeometryBuffer(geometry, RTC_BUFFER_TYPE_INDEX, 0, RTC_FORMAT_UINT3, 12, triangle_count),
+                peer->triangles.data(), sizeof(int) * 3 * triangle_count);
     rtcCommitGeometry(geometry);
     rtcAttachGeometry(peer->scene, geometry);
     rtcReleaseGeometry(geometry);
     rtcCommitScene(peer->scene);
-    return peer;
 }
 
 int peer_has_packets(const Peer* peer) { return rtcGetDeviceProperty(peer->device, RTC_DEVICE_PROPERTY_NATIVE_RAY16_SUPPORTED); }

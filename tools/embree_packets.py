@@ -111,6 +111,12 @@ class Packets:
         )
         self.native = bool(self._library.peer_has_packets(self._peer))
 
+    def rebuild(self) -> float:
+        """Milliseconds of the tree, made anew."""
+        start = time.perf_counter()
+        self._library.peer_build(self._peer)
+        return 1000.0 * (time.perf_counter() - start)
+
     def trace(self) -> float:
         """Milliseconds of both kinds of rays."""
         start = time.perf_counter()

@@ -15,10 +15,15 @@ STAGE = Path(__file__).resolve().parents[1] / "usd_scenes" / "sphere_on_checker.
 
 
 def with_pose(scene: wr.Scene, path: str, world_from_object: np.ndarray) -> wr.Scene:
-    """The scene with one prim elsewhere; meshes and materials are shared."""
-    known = scene.data.instances
-    placed = [dataclasses.replace(x, world_from_object=world_from_object) if x.prim_path == path else x for x in known]
-    return wr.Scene(dataclasses.replace(scene.data, instances=placed), scene.device)
+    """The scene with one prim elsewhere; once it is marked as what moves, all that does not is shared with the scene before."""
+    at = {
+        "world_from_object": world_from_object.copy(),
+        "moves": True,
+        "mover": path,
+    }  # the scene before keeps its own pose
+    known = scene.source_data.instances
+    placed = [dataclasses.replace(x, **at) if x.prim_path == path else x for x in known]
+    return wr.Scene(dataclasses.replace(scene.source_data, instances=placed), scene.device, earlier=scene)
 
 
 def main(stage=STAGE, mirror="/World/Mirror", device="cpu", steps=4) -> wr.Frame:
@@ -28,7 +33,8 @@ def main(stage=STAGE, mirror="/World/Mirror", device="cpu", steps=4) -> wr.Frame
     pose = next(each.world_from_object for each in scene.data.instances if each.prim_path == mirror).copy()
     frame = None
     for step in range(steps):
-        frame = wr.render_frame(with_pose(scene, mirror, pose), plan, previous=frame)
+        scene = with_pose(scene, mirror, pose)
+        frame = wr.render_frame(scene, plan, previous=frame)
         motion = frame.device_array("reflectionMotion")  # no copy; torch.from_dlpack(motion) or cupy.asarray(motion)
         longest = np.linalg.norm(motion.numpy(), axis=-1).max()
         print(f"step {step}: {int((frame['reflectedId'] > 0).sum())} mirror pixels, moved by up to {longest:.2f} px")

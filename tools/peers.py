@@ -557,6 +557,10 @@ class Wavefront:
             if (shape := scene.patch_shapes[k]) is not None and shape.kind == "quadric"
         ]
 
+    def rebuild(self) -> None:
+        """Give Embree the triangles anew, as they are."""
+        self.rays.build(self.source)
+
     def trace(self) -> tuple[float, float]:
         """Milliseconds of the mirror rays and of both."""
         start = time.perf_counter()

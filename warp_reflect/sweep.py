@@ -501,11 +501,7 @@ class Embree:
     """The mirror rays of a frame through embreex: nearest triangle, one thread, one call for all rays."""
 
     def __init__(self, scene: Scene, frame: Frame):
-        from embreex import rtcore_scene
-        from embreex.mesh_construction import TriangleMesh
-
-        self.scene = rtcore_scene.EmbreeScene()
-        TriangleMesh(self.scene, scene.host_points, scene.host_triangles)
+        self.build(scene)
         self.order = list(frame.layers)
         pixels = [layer.pixels for layer in frame.layers.values()]
         self.counts = [p.count for p in pixels]
@@ -513,6 +509,14 @@ class Embree:
         self.origins = np.ascontiguousarray(np.concatenate(points), np.float32)
         self.directions = np.ascontiguousarray(np.concatenate([p.direction.numpy() for p in pixels]), np.float32)
         self.hit = None
+
+    def build(self, scene: Scene) -> None:
+        """The tree over a scene's triangles; Embree commits it at the first ray."""
+        from embreex import rtcore_scene
+        from embreex.mesh_construction import TriangleMesh
+
+        self.scene = rtcore_scene.EmbreeScene()
+        TriangleMesh(self.scene, scene.host_points, scene.host_triangles)
 
     @classmethod
     def over(cls, scene: Scene, frame: Frame, notes: list[str] | None = None) -> Embree | None:
