@@ -177,9 +177,9 @@ def render(
             if ranged.workers < 1:
                 raise ValueError(f"--workers: got {ranged.workers}, expected 1 or more")
             if _is_rendered_here(ranged) and os.path.exists(stage):
-                # What every frame launches is compiled while the stage is opened.
+                # What every frame launches first is compiled while the stage is opened.
                 device = _open_device(opened.device)
-                kernels.begin(kernels.of_eye(_settings(planned), device), device)
+                kernels.begin(kernels.of_view(_settings(planned), device), device)
             names, channels, wanted, notes = _as_the_stage_asks(stage, names, aov, opened, planned)
             job = _job(stage, names, frames, channels, opened, wanted, ranged)
             if ranged.print_job is not None:

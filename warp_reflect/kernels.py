@@ -58,6 +58,20 @@ GLOSSY = {
 }
 
 
+_last: list[tuple[list[str], wp.DeviceLike]] = []
+
+
+def keep_last(names: list[str], device: wp.DeviceLike) -> None:
+    """Modules that nothing waits for before a frame is shaded: begun when planning has begun those it waits for itself."""
+    _last.append((names, device))
+
+
+def begin_last() -> None:
+    """Begin what was kept."""
+    while _last:
+        begin(*_last.pop())
+
+
 def of_eye(settings: Settings, device: wp.DeviceLike) -> list[str]:
     """Those of every frame: known before its stage is read."""
     return [*of_view(settings, device), *_of(["|shade_vector", "-shade/plain"], vectors(settings, device))]

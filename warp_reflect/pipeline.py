@@ -172,7 +172,8 @@ class OpenJob:
         self.plan: wr.Plan | None = None
         if os.path.exists(job.stage):
             device = job.load.get("device", "cpu")
-            kernels.begin(kernels.of_eye(job.settings, device), device)
+            kernels.begin(kernels.of_view(job.settings, device), device)
+            kernels.keep_last(kernels.of_eye(job.settings, device), device)
         self._scene = wr.load_stage(job.stage, time=job.times[place], **job.load)
         self._last: tuple[float | None, wr.Frame] | None = None
 

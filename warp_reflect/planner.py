@@ -605,9 +605,13 @@ def _look(
 ) -> tuple[dict[int, int], EyeView | None]:
     """(pixels of each part; what the camera sees, if it was drawn)."""
     casting = needs_probe(scene, settings)
-    if not scene.triangle_count or not (mirrors or panes or casting):
+    looks = scene.triangle_count > 0 and bool(mirrors or panes or casting)
+    if looks:
+        kernels.begin(kernels.of_view(settings, scene.device, casting, bool(mirrors)), scene.device)
+    if not (looks and casting):
+        kernels.begin_last()
+    if not looks:
         return dict.fromkeys([*mirrors, *panes], 0), None
-    kernels.begin(kernels.of_view(settings, scene.device, casting, bool(mirrors)), scene.device)
 
     def begin_mirrors(gbuffer: GBuffer) -> None:
         some = gbuffer.triangle.numpy()[::GLANCE]
@@ -616,6 +620,7 @@ def _look(
             is_mirror[list(scene.parts[part].patches)] = True
         if is_mirror[scene.host_triangle_patch[some[some >= 0]]].any():
             kernels.begin(kernels.of_mirrors(settings, scene.device, casting), scene.device)
+        kernels.begin_last()
 
     seen = look(scene, camera, dict(enumerate(mirrors, 1)), settings.threads, settings.kernels, begin_mirrors)
     return seen.pixels_of(scene, [*mirrors, *panes], settings.threads, settings.kernels), seen
