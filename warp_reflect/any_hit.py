@@ -30,7 +30,6 @@ ANY_HIT = (
         for (int g = 0; g < GROUPS; ++g) {
             left[g] = live[g];
             blocked[g] = I(0);
-            if (!bits(live[g])) continue;
             ray[g] = way_of(o[g], d[g]);
             octant[g] = ipick(d[g].x < 0.0f, I(1), I(0)) + ipick(d[g].y < 0.0f, I(2), I(0)) + ipick(d[g].z < 0.0f, I(4), I(0));
         }
@@ -46,6 +45,7 @@ ANY_HIT = (
             F furthest = F(0.0f);
             for (int g = 0; g < GROUPS; ++g) {
                 const unsigned all = bits(left[g]);
+                mask[g] = I(0);
                 if (!all) continue;
                 const Way& r = ray[g];
                 if (signs < 0) {
@@ -153,13 +153,9 @@ ANY_HIT = (
                     }
                     int asking[GROUPS], asking_count = 0;
                     I asked[GROUPS];
-                    for (int k = 0; k < some_count; ++k) {
-                        const int g = some[k];
-                        const I meet = box(g, of);
-                        if (!bits(meet)) continue;
-                        asking[asking_count++] = g;
-                        asked[g] = meet;
-                    }
+                    // All vectors at once: none waits for the branch of another.
+                    EACH_GROUP asked[g] = box(g, of);
+                    EACH_GROUP if (bits(asked[g])) asking[asking_count++] = g;
                     if (asking_count == 0) continue;
                     bool changed = false;
                     for (int chunk = ~child;; ++chunk) {

@@ -240,6 +240,7 @@ CODES += [SAME_TURN, FLATNESS, LEAST_COUNT, SHARP, LEAST_SPREAD, STEEP, TILE]
         const bool casts = to_sky || (distant ? cast_distant.data[light] : cast_areas.data[k]) != 0;
         // What would arrive unshadowed, `before`, and which points have to ask.
         int asking_count = 0;
+        unsigned marks[GROUPS] = {};
         for (int v = 0; v < GROUPS && first_of[v] < end; ++v) {
             const int start = first_of[v];
             auto row = [&](int r) -> F { return load(rows + r * stride + start); };
@@ -278,17 +279,38 @@ CODES += [SAME_TURN, FLATNESS, LEAST_COUNT, SHARP, LEAST_SPREAD, STEEP, TILE]
             }
             store(before + v * LANES, of_what);
             store(share + v * LANES, arrives);
-            for (unsigned left = bits(asks); left != 0; left &= left - 1)
-                asking[asking_count++] = v * LANES + __builtin_ctz(left);
+            marks[v] = bits(asks);
         }
+        // In tiles four columns after four: a vector's rays then start close together both ways.
+        const int columns = tiled ? 4 : LANES;
+        for (int from = 0; from < LANES; from += columns)
+            for (int v = 0; v < GROUPS; ++v)
+                for (unsigned left = marks[v] & ((1u << columns) - 1) << from; left != 0; left &= left - 1)
+                    asking[asking_count++] = v * LANES + __builtin_ctz(left);
         // The starts of those that ask, one after the other.
         float start[11][2 * BLOCK], brought[2 * BLOCK], arrived[2 * BLOCK];
         for (int v = 0; v * LANES < asking_count; ++v) {
             const I asked = v * LANES + lanes() < asking_count ? iload(asking + v * LANES) : I(asking[0]);
             const I own = points_of(asked);
-            const bool together = (v + 1) * LANES <= asking_count && own[LANES - 1] - own[0] == LANES - 1;
-            for (int r = 0; r < 11; ++r)
-                store(start[r] + v * LANES, together ? load(rows + r * stride + own[0]) : gather(rows + r * stride, own));
+            I lead;
+            EACH_LANE lead[l] = own[l & ~3];
+            const bool together = !bits(own - own[0] != lanes()), by_fours = !bits(own - lead != (lanes() & 3));
+            // Of a distant light all directions are the same, and only those to the sky look at the facet.
+            for (int r = 0; r < (distant ? 3 : 11); ++r) {
+                if (r >= 6 && r < 9 && !to_sky) continue;
+                const float* from = rows + r * stride;
+                F of_points;
+                if (together) {
+                    of_points = load(from + own[0]);
+                } else if (by_fours) {
+                    Four part[LANES / 4];
+                    for (int k = 0; k < LANES / 4; ++k) __builtin_memcpy(&part[k], from + own[4 * k], sizeof(Four));
+                    of_points = joined(part);
+                } else {
+                    of_points = gather(from, own);
+                }
+                store(start[r] + v * LANES, of_points);
+            }
             store(brought + v * LANES, F(0.0f));
             store(arrived + v * LANES, F(0.0f));
         }
