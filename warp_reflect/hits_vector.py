@@ -75,19 +75,25 @@ HITS = r"""
     };
     // Triangles of lanes. In memory: addresses are made of their numbers one by one, which takes them out of a vector anew
     // for every array that is read.
-    struct Triangles { int of[LANES]; bool alone, one_patch; };
+    struct Triangles { int of[LANES]; Runs runs; bool one_patch; };
     auto triangles_of = [&](I tri) -> Triangles {
         Triangles t;
         istore(t.of, tri);
         asm("" : "+m"(t.of));
-        t.alone = !bits(tri != tri[0]);
+        t.runs = runs_of(tri);
         return t;
     };
     auto patch_of = [&](Triangles& t) -> I {
         const int* all = scene.triangle_patch.data;
-        I patch = I(all[t.of[0]]);
+        I patch = I(all[t.runs.of[0]]);
         t.one_patch = true;
-        if (!t.alone) {
+        if (t.runs.alone) return patch;
+        if (t.runs.few) {
+            int own[4];
+            for (int k = 0; k < 4; ++k) own[k] = all[t.runs.of[k]];
+            t.one_patch = ((own[0] ^ own[1]) | (own[0] ^ own[2]) | (own[0] ^ own[3])) == 0;
+            patch = few_words(own, t.runs.which);
+        } else {
             EACH_LANE patch[l] = all[t.of[l]];
             t.one_patch = !bits(patch != patch[0]);
         }
@@ -103,10 +109,36 @@ HITS = r"""
         Corners at = {};
         const int* index = (const int*)indices.data;
         const float* value = (const float*)values.data;
-        if (t.alone) {
-            const int* own = index + 3 * t.of[0];
+        if (t.runs.alone) {
+            const int* own = index + 3 * t.runs.of[0];
             if (own[0] < 0) return at;
             return Corners{spread(value + 3 * own[0]), spread(value + 3 * own[1]), spread(value + 3 * own[2]), I(-1)};
+        }
+        if (t.runs.few) {
+            const int last = values.shape[0] - 1;
+            int named[4], start[3][4];
+            bool at_end = false;
+            _Pragma("clang loop unroll(full)") for (int k = 0; k < 4; ++k) {
+                named[k] = index[3 * t.runs.of[k]];
+                _Pragma("clang loop unroll(full)") for (int c = 0; c < 3; ++c) {
+                    const int i = index[3 * t.runs.of[k] + c];
+                    at_end |= i >= last;
+                    start[c][k] = 3 * (i < 0 ? 0 : i);
+                }
+            }
+            if ((named[0] & named[1] & named[2] & named[3]) < 0) return at;
+            // Of the last value there are but three floats to read.
+            if (!at_end) {
+                F of[4];
+                at.has = few_words(named, t.runs.which) >= 0;
+                few_fours(value, start[0], t.runs.which, of);
+                at.a = V{of[0], of[1], of[2]};
+                few_fours(value, start[1], t.runs.which, of);
+                at.b = V{of[0], of[1], of[2]};
+                few_fours(value, start[2], t.runs.which, of);
+                at.c = V{of[0], of[1], of[2]};
+                return at;
+            }
         }
         EACH_LANE at.has[l] = index[3 * t.of[l]];
         at.has = at.has >= 0;

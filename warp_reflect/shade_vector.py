@@ -158,7 +158,7 @@ HITS_SPLIT_MIN = 16  # blocks of rays; those of a few pixels meet triangles all 
                 const I glancing = ~seen | coated | (sharply & ~(even & reflector));
 
                 V p0, p1, p2;
-                corners(records.data, tri, p0, p1, p2);
+                corners_of(records.data, tri, triangles.runs, p0, p1, p2);
                 const Corners smooth = normals_of(triangles);
                 Corners colors = {};
                 if (bits(seen & colored)) colors = at_corners(triangles, scene.color_index, scene.colors);

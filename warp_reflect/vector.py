@@ -142,8 +142,17 @@ _HEAD = r"""
     auto last_pairs = [](F a, F b) -> F { return __builtin_shufflevector(a, b, 2, 3, 10, 11, 6, 7, 14, 15); };
     auto joined = [](const Four* r) -> F { return __builtin_shufflevector(r[0], r[1], 0, 1, 2, 3, 4, 5, 6, 7); };
 #endif
+    // Four rows of four floats in each block of 128 bits, as columns.
+    auto columns = [first_words, last_words, first_pairs, last_pairs](const F* r, F* out) {
+        const F s = first_words(r[0], r[1]), t = first_words(r[2], r[3]);
+        const F u = last_words(r[0], r[1]), v = last_words(r[2], r[3]);
+        out[0] = first_pairs(s, t);
+        out[1] = last_pairs(s, t);
+        out[2] = first_pairs(u, v);
+        out[3] = last_pairs(u, v);
+    };
     // Four floats at p[start[l]] of every lane, as four vectors. They are read into place.
-    auto fours = [joined, first_words, last_words, first_pairs, last_pairs](const float* p, const int* start, F* out) {
+    auto fours = [joined, columns](const float* p, const int* start, F* out) {
         F r[4];
         _Pragma("clang loop unroll(full)") for (int k = 0; k < 4; ++k) {
             Four part[LANES / 4];
@@ -151,12 +160,70 @@ _HEAD = r"""
                 __builtin_memcpy(&part[l], p + start[4 * l + k], sizeof(Four));
             r[k] = joined(part);
         }
-        const F s = first_words(r[0], r[1]), t = first_words(r[2], r[3]);
-        const F u = last_words(r[0], r[1]), v = last_words(r[2], r[3]);
-        out[0] = first_pairs(s, t);
-        out[1] = last_pairs(s, t);
-        out[2] = first_pairs(u, v);
-        out[3] = last_pairs(u, v);
+        columns(r, out);
+    };
+    // Lanes that lie side by side often ask for the same: alone, or in at most four runs, each of which asks once;
+    // `spread_out` gives every lane its own.
+    struct Runs { bool alone, few; int of[4]; I which; };
+    auto runs_of = [bits, lanes](I words) -> Runs {
+        Runs runs;
+        int all[LANES];
+        __builtin_memcpy(all, &words, sizeof(all));
+#if defined(__AVX512F__)
+        const I before = __builtin_shufflevector(words, words, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14);
+#else
+        const I before = __builtin_shufflevector(words, words, 0, 0, 1, 2, 3, 4, 5, 6);
+#endif
+        unsigned starts = bits(words != before);
+        runs.alone = starts == 0;
+        runs.of[0] = all[0];
+        runs.which = I(0);
+        _Pragma("clang loop unroll(full)") for (int k = 1; k < 4; ++k) {
+            const int start = __builtin_ctz(starts | 1u << LANES);
+            starts &= starts - 1;
+            runs.of[k] = all[start & (LANES - 1)];
+            runs.which -= lanes() >= start;
+        }
+        runs.few = starts == 0;
+        return runs;
+    };
+    // Of vectors whose blocks of 128 bits are all the same.
+    auto spread_out = [](F blocks, I which) -> F {
+#ifdef __AVX512F__
+        return __builtin_ia32_vpermilvarps512(blocks, which);
+#elif defined(__AVX__)
+        typedef int Words __attribute__((ext_vector_type(8)));
+        _Pragma("clang loop unroll(full)") for (int part = 0; part < LANES; part += 8) {
+            Row row;
+            Words own;
+            __builtin_memcpy(&row, (const float*)&blocks + part, sizeof(row));
+            __builtin_memcpy(&own, (const int*)&which + part, sizeof(own));
+            row = __builtin_ia32_vpermilvarps256(row, own);
+            __builtin_memcpy((float*)&blocks + part, &row, sizeof(row));
+        }
+        return blocks;
+#else
+        F v;
+        EACH_LANE v[l] = blocks[which[l] & 3];
+        return v;
+#endif
+    };
+    auto few_fours = [joined, columns, spread_out](const float* p, const int* start, I which, F* out) {
+        F r[4];
+        _Pragma("clang loop unroll(full)") for (int k = 0; k < 4; ++k) {
+            Four part[LANES / 4];
+            _Pragma("clang loop unroll(full)") for (int l = 0; l < LANES / 4; ++l)
+                __builtin_memcpy(&part[l], p + start[k], sizeof(Four));
+            r[k] = joined(part);
+        }
+        columns(r, out);
+        _Pragma("clang loop unroll(full)") for (int k = 0; k < 4; ++k) out[k] = spread_out(out[k], which);
+    };
+    auto few_words = [joined, spread_out](const int* words, I which) -> I {
+        Four one, part[LANES / 4];
+        __builtin_memcpy(&one, words, sizeof(one));
+        _Pragma("clang loop unroll(full)") for (int l = 0; l < LANES / 4; ++l) part[l] = one;
+        return __builtin_bit_cast(I, spread_out(joined(part), which));
     };
     // Eight floats.
     auto gather8 = [fours](const float* p, I start, F* out) {
@@ -274,28 +341,39 @@ _HEAD = r"""
     auto irow = [iload, igather](const int* p, int start, bool full, I own) -> I {
         return full ? iload(p + start) : igather(p, own);
     };
-    // Corners of triangles, from `Scene.triangle_records`. Neighbours in a picture often lie on the same.
-    auto corners = [fours, bits](const float* records, I triangle, V& p0, V& p1, V& p2) {
-        if (!bits(triangle != triangle[0])) {
-            const float* p = records + 12 * triangle[0];
+    // Corners of triangles, from `Scene.triangle_records`.
+    auto corners_of = [fours, few_fours](const float* records, I triangle, const Runs& runs, V& p0, V& p1, V& p2) {
+        if (runs.alone) {
+            const float* p = records + 12 * runs.of[0];
             p0 = V{F(p[0]), F(p[1]), F(p[2])};
             p1 = V{F(p[3]), F(p[4]), F(p[5])};
             p2 = V{F(p[6]), F(p[7]), F(p[8])};
             return;
         }
         F corner[12];
-        int at[LANES];
-        const I start = 12 * triangle;
-        __builtin_memcpy(at, &start, sizeof(at));
-        _Pragma("clang loop unroll(full)") for (int k = 0; k < 12; k += 4) fours(records + k, at, corner + k);
+        if (runs.few) {
+            int at[4];
+            for (int k = 0; k < 4; ++k) at[k] = 12 * runs.of[k];
+            _Pragma("clang loop unroll(full)") for (int k = 0; k < 12; k += 4)
+                few_fours(records + k, at, runs.which, corner + k);
+        } else {
+            int at[LANES];
+            const I start = 12 * triangle;
+            __builtin_memcpy(at, &start, sizeof(at));
+            _Pragma("clang loop unroll(full)") for (int k = 0; k < 12; k += 4) fours(records + k, at, corner + k);
+        }
         p0 = V{corner[0], corner[1], corner[2]};
         p1 = V{corner[3], corner[4], corner[5]};
         p2 = V{corner[6], corner[7], corner[8]};
+    };
+    auto corners = [corners_of, runs_of](const float* records, I triangle, V& p0, V& p1, V& p2) {
+        corners_of(records, triangle, runs_of(triangle), p0, p1, p2);
     };
     (void)bits; (void)lanes; (void)pick; (void)ipick; (void)fmin; (void)fmax; (void)sub; (void)add; (void)dot; (void)cross;
     (void)load; (void)iload; (void)store; (void)istore; (void)gather; (void)igather; (void)vgather; (void)halves; (void)fours;
     (void)gather8; (void)product; (void)vpick; (void)same; (void)grey; (void)spread; (void)clip; (void)unit; (void)corners;
     (void)facet_normal; (void)vload; (void)vstore; (void)vstore4; (void)vrows; (void)frow; (void)irow; (void)transposed;
+    (void)few_words; (void)corners_of;
 """
 
 # Beside it, for the rasteriser's snippets: rows of triangles.
