@@ -297,7 +297,8 @@ _TARGET = (
         const int fragment = (int)((unsigned)runs[k] >> 8), length = runs[k] & 255;
         const int at = cell_of[fragment >> 16] + (fragment >> 8 & 255) * width + (fragment & 255);
         __builtin_prefetch(keys + at);
-        __builtin_prefetch(ray_of + 8 * at);
+        // Two rays fill a cache line.
+        for (int part = 0; part < length; part += 2) __builtin_prefetch(ray_of + 8 * (at + part));
         __builtin_prefetch(ray_of + 8 * (at + length - 1));
         for (int part = 0; part < length; part += LANES) istore(list + listed + part, fragment + part + lanes());
         listed += length;
