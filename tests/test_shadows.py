@@ -104,6 +104,19 @@ def test_neighbours_share_where_a_penumbra_is_wide_and_ask_where_it_is_narrow():
         assert 0.0 < error[1] < most * error[0], error
 
 
+@pytest.mark.parametrize("size", [(64, 40), (70, 38)], ids=["whole tiles", "rows"])
+@pytest.mark.parametrize("shared", [False, True])
+def test_blocks_of_rays_find_what_single_rays_do(size, shared):
+    """Whatever way a picture is cut into blocks, and in memory that held another picture before."""
+    scene, camera, _ = under_a_card(LAMPS["sphere"], size)
+    points = direct.points_of(scene, raster.draw_scene(scene, camera))
+    cast = replace(shadows.every_shadow(scene, 16), shared=shared)
+    plain = shadows.shadowed_irradiance(scene, points, cast, kernels="plain").numpy()
+    for threads in (1, 2):
+        blocks = shadows.shadowed_irradiance(scene, points, cast, threads).numpy()
+        np.testing.assert_allclose(blocks, plain, rtol=1.0e-5, atol=1.0e-6)
+
+
 def test_no_light_below_the_horizon_or_from_behind_a_shape():
     """A rect that looks away, and one under the ground: dark, and no ray decides anything."""
     for world in (turned(np.pi / 2, 0.0, (0, 2, 0)), turned(-np.pi / 2, 0.0, (0, -1, 0))):

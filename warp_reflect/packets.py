@@ -111,6 +111,8 @@ RAYS = r"""
         const F low = fmin(fmin(edge_u, edge_v), edge_w), high = fmax(fmax(edge_u, edge_v), edge_w);
         const F det = edge_u + edge_v + edge_w;
         I hit = asked & ~((low < 0.0f) & (high > 0.0f)) & (det != 0.0f);
+        // Most that is asked is passed by: no need to divide.
+        if constexpr (!decltype(nearest)::value) if (!bits(hit)) return hit;
         const F along = edge_u * (r.sz * a_z) + edge_v * (r.sz * b_z) + edge_w * (r.sz * c_z);
         const F inverse_det = 1.0f / det;
         const F t = along * inverse_det;

@@ -436,7 +436,6 @@ def shadowed_irradiance(
     """
     device = scene.device
     count = len(points.triangle)
-    result = wp.zeros(count, dtype=wp.vec3, device=device)
     of_lights = cast.distant, cast.areas
     distant, areas = scene.kept("lights that cast", of_lights, lambda: [_flags(each, device) for each in of_lights])
     mesh, lights = wp.uint64(scene.shadow_tracer.id), scene.lights.direct
@@ -445,8 +444,10 @@ def shadowed_irradiance(
 
         at = [*_arrays(points, normals, device), points.pixel, points.width]
         inputs = [mesh, scene.view, lights, distant, areas, *at, cast.samples]
+        result = wp.zeros(count, dtype=wp.vec3, device=device)
         cut_shadows.cut_irradiance(inputs, result, threads)
         return result
+    result = wp.empty(count, dtype=wp.vec3, device=device)
     around = neighbours_of(points, len(areas) if any(cast.areas) else 0, cast.shared, threads)
     samples = first_count(cast.samples), shared_count(cast.samples) if cast.shared else 0, cast.samples
     send = _irradiance
