@@ -143,7 +143,7 @@ _HEAD = r"""
     auto joined = [](const Four* r) -> F { return __builtin_shufflevector(r[0], r[1], 0, 1, 2, 3, 4, 5, 6, 7); };
 #endif
     // Four rows of four floats in each block of 128 bits, as columns.
-    auto columns = [first_words, last_words, first_pairs, last_pairs](const F* r, F* out) {
+    auto four_columns = [first_words, last_words, first_pairs, last_pairs](const F* r, F* out) {
         const F s = first_words(r[0], r[1]), t = first_words(r[2], r[3]);
         const F u = last_words(r[0], r[1]), v = last_words(r[2], r[3]);
         out[0] = first_pairs(s, t);
@@ -152,7 +152,7 @@ _HEAD = r"""
         out[3] = last_pairs(u, v);
     };
     // Four floats at p[start[l]] of every lane, as four vectors. They are read into place.
-    auto fours = [joined, columns](const float* p, const int* start, F* out) {
+    auto fours = [joined, four_columns](const float* p, const int* start, F* out) {
         F r[4];
         _Pragma("clang loop unroll(full)") for (int k = 0; k < 4; ++k) {
             Four part[LANES / 4];
@@ -160,7 +160,7 @@ _HEAD = r"""
                 __builtin_memcpy(&part[l], p + start[4 * l + k], sizeof(Four));
             r[k] = joined(part);
         }
-        columns(r, out);
+        four_columns(r, out);
     };
     // Lanes that lie side by side often ask for the same: alone, or in at most four runs, each of which asks once;
     // `spread_out` gives every lane its own.
@@ -208,7 +208,7 @@ _HEAD = r"""
         return v;
 #endif
     };
-    auto few_fours = [joined, columns, spread_out](const float* p, const int* start, I which, F* out) {
+    auto few_fours = [joined, four_columns, spread_out](const float* p, const int* start, I which, F* out) {
         F r[4];
         _Pragma("clang loop unroll(full)") for (int k = 0; k < 4; ++k) {
             Four part[LANES / 4];
@@ -216,7 +216,7 @@ _HEAD = r"""
                 __builtin_memcpy(&part[l], p + start[k], sizeof(Four));
             r[k] = joined(part);
         }
-        columns(r, out);
+        four_columns(r, out);
         _Pragma("clang loop unroll(full)") for (int k = 0; k < 4; ++k) out[k] = spread_out(out[k], which);
     };
     auto few_words = [joined, spread_out](const int* words, I which) -> I {
