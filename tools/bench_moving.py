@@ -19,7 +19,6 @@ import time
 from pathlib import Path
 
 import numpy as np
-import warp as wp
 
 sys.path.insert(0, str(Path(__file__).parent))
 from bench_frames import commit, machine
@@ -27,6 +26,7 @@ from embree_packets import Packets
 from peers import Wavefront
 
 import warp_reflect as wr
+from warp_reflect.devices import open_device
 
 LIFT = 1.0e-3  # a round, of the scene's size
 WARM_UP = 2  # rounds
@@ -64,7 +64,7 @@ def lifted(scene: wr.Scene, height: float) -> wr.Scene:
 
 def main() -> None:
     arguments = parse()
-    wp.config.quiet = True
+    open_device("cpu")  # quietly
     size = tuple(int(side) for side in arguments.size.split("x"))
     scene = movable(wr.load_stage(arguments.stage), arguments.prim)
     moved = sum(len(scene.data.meshes[each.mesh].triangles) for each in scene.data.instances if each.moves)
