@@ -7,6 +7,7 @@ from test_shade import WHITE, ball_mesh, distant, dome, ground, look_at, place, 
 
 import warp_reflect as wr
 from warp_reflect import bvh, direct, raster, shadows, surface, vector
+from warp_reflect.any_hit import ANY_HIT
 from warp_reflect.launch import FINITE_FLAGS, launch
 from warp_reflect.layers import MirrorPixels, ReflectionLayer
 from warp_reflect.scene import LightData, MaterialData
@@ -23,39 +24,79 @@ FAR = 3.0e38
     vector.snippet(
         TRAVERSAL
         + r"""
+    constexpr int GROUPS = 2;
+    struct Pair { enum { value = GROUPS }; static constexpr bool first_alone() { return false; } };
     const int count = origins.shape[0];
     const int begin = block * BLOCK;
     const int end = begin + BLOCK < count ? begin + BLOCK : count;
-    for (int start = begin; start < end; start += LANES) {
-        const I valid = start + lanes() < end;
-        const I own = ipick(valid, start + lanes(), I(end - 1));
-        const V o = vgather((const float*)origins.data, own), d = vgather((const float*)directions.data, own);
-        const F far = gather(reach.data, own);
-        const I met = is_met(valid, o, d, far);
-        const Met nearest = first_met(valid, o, d, far);
-        for (int l = 0; l < LANES && start + l < end; ++l) {
-            out_met.data[start + l] = met[l] != 0;
-            out_face.data[start + l] = nearest.face[l];
-            if (nearest.face[l] < 0) continue;
-            out_t.data[start + l] = nearest.t[l];
-            out_u.data[start + l] = nearest.u[l];
-            out_v.data[start + l] = nearest.v[l];
+    for (int start = begin; start < end; start += GROUPS * LANES) {
+        I valid[GROUPS];
+        V o[GROUPS], d[GROUPS];
+        F far[GROUPS];
+        for (int g = 0; g < GROUPS; ++g) {
+            const I at = start + g * LANES + lanes();
+            valid[g] = at < end;
+            const I own = ipick(valid[g], at, I(end - 1));
+            o[g] = vgather((const float*)origins.data, own);
+            d[g] = vgather((const float*)directions.data, own);
+            far[g] = gather(reach.data, own);
+        }
+        Met nearest[GROUPS];
+        find_nearest(Pair{}, valid, o, d, far, nearest);
+        for (int k = 0; k < GROUPS * LANES && start + k < end; ++k) {
+            const int g = k / LANES, l = k % LANES;
+            out_face.data[start + k] = nearest[g].face[l];
+            if (nearest[g].face[l] < 0) continue;
+            out_t.data[start + k] = nearest[g].t[l];
+            out_u.data[start + k] = nearest[g].u[l];
+            out_v.data[start + k] = nearest[g].v[l];
         }
     }
 """
     )
 )
-def query_block(
+def nearest_block(
+    block: int,
+    mesh_id: wp.uint64,
+    origins: wp.array(dtype=wp.vec3),
+    directions: wp.array(dtype=wp.vec3),
+    reach: wp.array(dtype=float),
+    out_face: wp.array(dtype=int),
+    out_t: wp.array(dtype=float),
+    out_u: wp.array(dtype=float),
+    out_v: wp.array(dtype=float),
+): ...
+
+
+@wp.func_native(
+    vector.snippet(
+        ANY_HIT
+        + r"""
+    const int count = origins.shape[0];
+    I valid[GROUPS], blocked[GROUPS];
+    V o[GROUPS], d[GROUPS];
+    F far[GROUPS];
+    for (int g = 0; g < GROUPS; ++g) {
+        const I at = block * BLOCK + g * LANES + lanes();
+        valid[g] = at < count;
+        const I own = ipick(valid[g], at, I(count - 1));
+        o[g] = vgather((const float*)origins.data, own);
+        d[g] = vgather((const float*)directions.data, own);
+        far[g] = gather(reach.data, own);
+    }
+    find_blocked(valid, o, d, far, blocked);
+    for (int k = 0; k < BLOCK && block * BLOCK + k < count; ++k)
+        out_met.data[block * BLOCK + k] = blocked[k / LANES][k % LANES] != 0;
+"""
+    )
+)
+def blocked_block(
     block: int,
     mesh_id: wp.uint64,
     origins: wp.array(dtype=wp.vec3),
     directions: wp.array(dtype=wp.vec3),
     reach: wp.array(dtype=float),
     out_met: wp.array(dtype=int),
-    out_face: wp.array(dtype=int),
-    out_t: wp.array(dtype=float),
-    out_u: wp.array(dtype=float),
-    out_v: wp.array(dtype=float),
 ): ...
 
 
@@ -73,7 +114,8 @@ def query_blocks_kernel(
     out_v: wp.array(dtype=float),
 ):
     block = first + wp.tid()
-    query_block(block, mesh_id, origins, directions, reach, out_met, out_face, out_t, out_u, out_v)
+    nearest_block(block, mesh_id, origins, directions, reach, out_face, out_t, out_u, out_v)
+    blocked_block(block, mesh_id, origins, directions, reach, out_met)
 
 
 @wp.kernel

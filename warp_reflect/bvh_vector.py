@@ -214,7 +214,7 @@ _CONSTANTS = f"""
         left_out = own_branches.shape[0] > 0 && !bits(grazing) ? own_branches.data : 0;
         for (int round = 0; round < 2; ++round) {
             Met found[GROUPS];
-            traverse(Nearest{}, Tile{taken <= LANES}, missed, o, d, reach, found);
+            find_nearest(Tile{taken <= LANES}, missed, o, d, reach, found);
             I some = I(0);
             for (int g = 0; g < GROUPS; ++g) {
                 Met& m = met[g];

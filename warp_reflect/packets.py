@@ -9,7 +9,6 @@ from __future__ import annotations
 
 # After `vector.snippet`'s head.
 RAYS = r"""
-    typedef float Four __attribute__((ext_vector_type(4)));
     // The least or the most of a vector, half by half: the compiler's own reduction minds NaN, one lane after the other.
     auto folded = [](F v, auto better) -> float {
 #if defined(__AVX512F__)
@@ -127,9 +126,7 @@ RAYS = r"""
     };
     struct Nearest { enum { value = 1 }; };
     struct Any { enum { value = 0 }; };
-    // How many vectors of rays go together, and whether those after the first are empty.
-    struct One { enum { value = 1 }; static constexpr bool first_alone() { return false; } };
-    struct Two { enum { value = 2 }; static constexpr bool first_alone() { return false; } };
+    struct One { enum { value = 1 }; };
     (void)flushed; (void)slab; (void)folded; (void)lesser; (void)larger;
 #define EACH_GROUP _Pragma("clang loop unroll(full)") for (int g = 0; g < GROUPS; ++g)
 """
