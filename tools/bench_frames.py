@@ -197,8 +197,8 @@ def bench(stage: str, size: tuple[int, int], arguments) -> list[dict]:
 
 
 def wavefront(scene, frame):
-    """Embree's eye and mirror rays by `peers.Wavefront`; None where nothing is reflected."""
-    from peers import Wavefront  # which imports this module
+    """Embree's eye and mirror rays by `wavefronts.Wavefront`; None where nothing is reflected."""
+    from wavefronts import Wavefront
 
     return Wavefront(scene, frame) if frame.layers else None
 

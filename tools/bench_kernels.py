@@ -5,7 +5,7 @@
 A row is a loop of the frame: its kernels' time with `kernels=plain` and `kernels=vector` (medians of this thread's processor
 time, so that others on the machine count less), their ratio, and elements a second. The rasteriser's rows have culling and
 order in them, not the projection of vertices; their elements are triangles, those that are culled too. The last rows are the
-whole frame and, where it is installed, Embree's eye and mirror rays through embreex without shading (`peers.Wavefront`).
+whole frame and, where it is installed, Embree's eye and mirror rays through embreex without shading (`wavefronts.Wavefront`).
 """
 
 from __future__ import annotations

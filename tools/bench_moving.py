@@ -23,7 +23,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent))
 from bench_frames import commit, machine
 from embree_packets import Packets
-from peers import Wavefront
+from wavefronts import Wavefront
 
 import warp_reflect as wr
 from warp_reflect.devices import open_device

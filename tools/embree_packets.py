@@ -15,11 +15,10 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+from wavefronts import NOTHING, RAY_STEP
 
 SOURCE = Path(__file__).with_suffix(".cpp")
 FLAGS = "-std=c++17", "-O3", "-march=native", "-shared", "-fPIC", "-pthread"
-RAY_STEP = 1.0e-4  # of the scene's size: where mirror rays begin, as in `peers.Wavefront`
-NOTHING = -2  # a pixel that shows no mirror
 
 
 class _Camera(ctypes.Structure):
@@ -56,7 +55,7 @@ class Packets:
     """A frame's eye rays and mirror rays by Embree's packets: hits, no shading.
 
     Args:
-        wavefront: `peers.Wavefront` of the same frame, which knows its mirrors and their normals.
+        wavefront: `wavefronts.Wavefront` of the same frame, which knows its mirrors and their normals.
         threads: CPU threads.
 
     Raises:
@@ -80,18 +79,15 @@ class Packets:
             camera.orthographic,
         )
         self.triangle = np.full(camera.size[0] * camera.size[1], NOTHING, np.int32)
-        patch = np.asarray(scene.host_triangle_patch)
         quadric_of_patch = np.full(len(scene.patch_shapes), -1, np.int32)
-        rows = []
-        for k, unit_from_scene, shape in wavefront.curved:
-            quadric_of_patch[k] = len(rows)
-            rows.append([*unit_from_scene[:3].ravel(), shape.a, shape.b])
+        quadric_of_patch[list(wavefront.quadric_rows)] = np.arange(len(wavefront.quadric_rows))
+        rows = list(wavefront.quadric_rows.values())
         arrays = (
             np.ascontiguousarray(scene.host_points, np.float32),
             np.ascontiguousarray(scene.host_triangles, np.int32),
             np.ascontiguousarray(scene.host_normals, np.float32),
             np.ascontiguousarray(scene.host_normal_index, np.int32),
-            np.where(wavefront.is_mirror[patch], patch, -1).astype(np.int32),
+            wavefront.mirror_patch,
             np.asarray(rows, np.float32).reshape(len(rows), 14),
             quadric_of_patch,
         )

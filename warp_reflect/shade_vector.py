@@ -380,9 +380,8 @@ def shade_rays(
     """What `shade.seen_radiance_kernel` does; `light` as in `shade_eye`."""
     device = scene.device
     rays = [layer.pixels.direction, layer.u, layer.v]
-    blocks = RAY_BLOCKS
     inputs = [
-        blocks,
+        RAY_BLOCKS,
         0,
         scene.view,
         scene.triangle_records,
@@ -393,7 +392,7 @@ def shade_rays(
         *rays,
     ]
     inputs += [none(wp.vec4, device), none(wp.vec3, device), radiance]
-    vector.launch_blocks(shade_blocks_kernel, layer.pixels.count, inputs, device, threads, blocks, HITS_SPLIT_MIN)
+    vector.launch_blocks(shade_blocks_kernel, layer.pixels.count, inputs, device, threads, RAY_BLOCKS, HITS_SPLIT_MIN)
 
 
 @wp.func_native(

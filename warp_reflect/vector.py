@@ -151,16 +151,19 @@ _HEAD = r"""
         out[2] = first_pairs(u, v);
         out[3] = last_pairs(u, v);
     };
-    // Four floats at p[start[l]] of every lane, as four vectors. They are read into place.
-    auto fours = [joined, four_columns](const float* p, const int* start, F* out) {
+    // Four floats at p[start_of(l)] of every lane l, as four vectors. They are read into place.
+    auto fours_at = [joined, four_columns](const float* p, auto start_of, F* out) {
         F r[4];
         _Pragma("clang loop unroll(full)") for (int k = 0; k < 4; ++k) {
             Four part[LANES / 4];
             _Pragma("clang loop unroll(full)") for (int l = 0; l < LANES / 4; ++l)
-                __builtin_memcpy(&part[l], p + start[4 * l + k], sizeof(Four));
+                __builtin_memcpy(&part[l], p + start_of(4 * l + k), sizeof(Four));
             r[k] = joined(part);
         }
         four_columns(r, out);
+    };
+    auto fours = [fours_at](const float* p, const int* start, F* out) {
+        fours_at(p, [start](int lane) { return start[lane]; }, out);
     };
     // Lanes that lie side by side often ask for the same: alone, or in at most four runs, each of which asks once;
     // `spread_out` gives every lane its own.
@@ -208,15 +211,8 @@ _HEAD = r"""
         return v;
 #endif
     };
-    auto few_fours = [joined, four_columns, spread_out](const float* p, const int* start, I which, F* out) {
-        F r[4];
-        _Pragma("clang loop unroll(full)") for (int k = 0; k < 4; ++k) {
-            Four part[LANES / 4];
-            _Pragma("clang loop unroll(full)") for (int l = 0; l < LANES / 4; ++l)
-                __builtin_memcpy(&part[l], p + start[k], sizeof(Four));
-            r[k] = joined(part);
-        }
-        four_columns(r, out);
+    auto few_fours = [fours_at, spread_out](const float* p, const int* start, I which, F* out) {
+        fours_at(p, [start](int lane) { return start[lane % 4]; }, out);
         _Pragma("clang loop unroll(full)") for (int k = 0; k < 4; ++k) out[k] = spread_out(out[k], which);
     };
     auto few_words = [joined, spread_out](const int* words, I which) -> I {

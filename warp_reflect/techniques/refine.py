@@ -17,7 +17,6 @@ from warp_reflect.layers import GBuffer, MirrorPixels, ReflectionLayer
 from warp_reflect.scene import Scene, SceneView
 from warp_reflect.settings import Settings, Status
 from warp_reflect.shapes import clamp_weights, intersect_triangle
-from warp_reflect.techniques import refine_vector
 from warp_reflect.techniques.virtual_mesh import VirtualMesh
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FINITE_FLAGS})
@@ -263,6 +262,8 @@ def doubt_coarse(
     rays = [coarse, point, direction, layer.triangle, layer.distance]
     if vector.chosen(settings.kernels, scene.device):
         inputs = [scene.triangle_records, *rays, DOUBT, settled]
+        from warp_reflect.techniques import refine_vector  # which decides as this module's kernels do
+
         vector.launch_blocks(refine_vector.coarse_blocks_kernel, len(point), inputs, scene.device, settings.threads)
     else:
         launch(coarse_kernel, len(point), [scene.view, *rays, settled], scene.device, settings.threads)
@@ -349,17 +350,13 @@ def settle(
     how = [settings.walk_hops, int(settings.refine == "strict"), caution]
     outputs = [layer.triangle, layer.u, layer.v, layer.distance, layer.status, settled]
     if vector.chosen(settings.kernels, scene.device):
+        from warp_reflect.techniques import refine_vector  # which decides as this module's kernels do
+
         records = [target.view, scene.neighbours, scene.triangle_records]
         limits = [DEPTH_STEP, FINE_STEP, NEARER_SHARE, CONVERGED, SKY]
         inputs = [*records, *picture, *how, *limits, *outputs]
-        vector.launch_blocks(
-            refine_vector.settle_blocks_kernel,
-            pixels.count,
-            inputs,
-            scene.device,
-            settings.threads,
-            refine_vector.BLOCKS,
-        )
+        kernel, blocks = refine_vector.settle_blocks_kernel, refine_vector.BLOCKS
+        vector.launch_blocks(kernel, pixels.count, inputs, scene.device, settings.threads, blocks)
     else:
         inputs = [scene.view, scene.neighbours, scene.closed_patches, target.view, *picture, *how, *outputs]
         launch(settle_kernel, pixels.count, inputs, scene.device, settings.threads)

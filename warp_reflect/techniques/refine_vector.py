@@ -9,6 +9,7 @@ from __future__ import annotations
 import warp as wp
 
 from warp_reflect import raster, vector
+from warp_reflect.techniques.refine import CANDIDATE, DOUBT, EMPTY, WALK
 
 wp.set_module_options({"enable_backward": False})
 
@@ -17,20 +18,22 @@ BLOCKS = 4  # of a task: its lists fill vectors, and what they hold stays in the
 
 @wp.func_native(
     vector.snippet(
-        vector.TRIANGLES
+        f"""
+    constexpr int TASK = {BLOCKS} * BLOCK;
+    constexpr int DOUBT = {int(DOUBT)}, CANDIDATE = {int(CANDIDATE)}, WALK = {int(WALK)}, EMPTY = {int(EMPTY)};
+"""
+        + vector.TRIANGLES
         + r"""
     const int count = pixel.shape[0];
     const int box_width = target.x1 - target.x0;
     const unsigned long long* keys = (const unsigned long long*)target.key.data;
     const int* next_triangle = (const int*)neighbours.data;
     const float* record = records.data;
-    constexpr int TASK = BLOCKS * BLOCK;
     const int begin = task * TASK;
     const int end = begin + TASK < count ? begin + TASK : count;
 
     // Of a task's pixels: rays, eight numbers each, and what is found. Of walks: the pixel, the triangle, the one before it, how
     // the first one faced the ray, and their number. A vector more for the last load of a row.
-    constexpr int DOUBT = 0, HIT = 1, WALKED = 2, EMPTY = 3;  // `refine.DOUBT` and so on
     float origins[4 * TASK + 4], rays[4 * TASK + 4], best_u[TASK], best_v[TASK], best_t[TASK], facing_of[8 * TASK + LANES];
     int best_triangle[TASK], best_hops[TASK], state[TASK];
     int asker[8 * TASK + LANES], asked[8 * TASK + LANES], previous_of[8 * TASK + LANES], number_of[8 * TASK + LANES];
@@ -247,7 +250,7 @@ BLOCKS = 4  # of a task: its lists fill vectors, and what they hold stays in the
                 packed(asker + ask_count, place + lanes(), left);
                 ask_count += packed(asked + ask_count, other, left);
             }
-            settled = ipick(live, I(HIT), settled);
+            settled = ipick(live, I(CANDIDATE), settled);
         }
         istore(state + place, settled);
     }
@@ -273,7 +276,7 @@ BLOCKS = 4  # of a task: its lists fill vectors, and what they hold stays in the
         const I place = ipick(valid, iload(asker + start), I(asker[start]));
         const I drawn = ipick(valid, iload(asked + start), I(asked[start]));
         const I triangle = igather(parents.data, drawn), known = igather(best_triangle, place);
-        const unsigned left = marks(valid & (igather(state, place) == HIT) & (known >= 0) & (triangle != known));
+        const unsigned left = marks(valid & (igather(state, place) == CANDIDATE) & (known >= 0) & (triangle != known));
         packed(asker + asks, place, left);
         asks += packed(asked + asks, triangle, left);
     }
@@ -295,7 +298,7 @@ BLOCKS = 4  # of a task: its lists fill vectors, and what they hold stays in the
     for (int k = 0; k < found_count; ++k) {
         const Nearer& hit = found[k];
         const int i = hit.place;
-        if (state[i] != HIT || !(hit.t < best_t[i])) continue;
+        if (state[i] != CANDIDATE || !(hit.t < best_t[i])) continue;
         if (hit.turned) state[i] = DOUBT;
         best_hops[i] = hit.hops;
         best_triangle[i] = hit.triangle;
@@ -306,10 +309,10 @@ BLOCKS = 4  # of a task: its lists fill vectors, and what they hold stays in the
     for (int start = begin; start < end; start += LANES) {
         const int place = start - begin;
         const I as = iload(state + place), triangle = iload(best_triangle + place), empty = as == EMPTY;
-        I hit = (as == HIT) & (triangle >= 0);
+        I hit = (as == CANDIDATE) & (triangle >= 0);
         const I by_walk = hit & (iload(best_hops + place) > 0);
         if (wary != 0) hit &= ~by_walk;
-        const I who = ipick(hit, ipick(by_walk, I(WALKED), I(HIT)), ipick(empty, I(EMPTY), I(DOUBT)));
+        const I who = ipick(hit, ipick(by_walk, I(WALK), I(CANDIDATE)), ipick(empty, I(EMPTY), I(DOUBT)));
         if (start + LANES <= end) {
             // What is in doubt stays as it is.
             const Bytes of = __builtin_convertvector(who, Bytes);
@@ -340,7 +343,7 @@ BLOCKS = 4  # of a task: its lists fill vectors, and what they hold stays in the
             }
         }
     }
-""".replace("BLOCKS", str(BLOCKS))
+"""
     )
 )
 def settle_block(
