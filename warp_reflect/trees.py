@@ -36,6 +36,7 @@ class Tree:
         self.mesh = wp.Mesh(points, indices, groups=of_triangle, **kind)
         self._wide: WideTree | None = None
         self._fitted: wp.array | None = points
+        self._wide_fits = False
 
     def to(self, points: wp.array) -> Tree:
         """Fit it to points, if it is not."""
@@ -43,18 +44,20 @@ class Tree:
             if self.mesh.points is not points:
                 wp.copy(self.mesh.points, points)
             self.mesh.refit()
-            if self._wide is not None:
-                self._wide.fit()
-            self._fitted = points
+            self._fitted, self._wide_fits = points, False
         return self
 
     def loosen(self) -> None:
         """Points were moved in place: it is fitted when it is asked for next."""
-        self._fitted = None
+        self._fitted, self._wide_fits = None, False
+
+    def has_packets(self, points: wp.array) -> bool:
+        """Whether what packets walk down is there, and fitted to these points."""
+        return self._wide_fits and self._fitted is points
 
     @property
     def packets(self) -> int:
-        """Handle for the snippets of `wide_packets.py`; on the CPU only, laid out at first use."""
+        """Handle for the snippets of `wide_packets.py`; on the CPU only, laid out at first use, fitted where it is not."""
         return self.wide.id
 
     @property
@@ -64,6 +67,9 @@ class Tree:
             from warp_reflect.wide_tree import WideTree  # not compiled where there are no packets
 
             self._wide = WideTree(self.mesh)
+        elif not self._wide_fits:
+            self._wide.fit()
+        self._wide_fits = True
         return self._wide
 
 
