@@ -175,7 +175,7 @@ def lit(lights, device, **more):
 def test_few_points_decide_what_is_clear_and_all_decide_the_rest(device, monkeypatch):
     spacings = []
     tried = probe.probe
-    monkeypatch.setattr(planner, "probe", lambda *given: spacings.append(given[-1]) or tried(*given))
+    monkeypatch.setattr(planner, "probe", lambda *given: spacings.append(given[3]) or tried(*given))
     high = LightData("/sun", "distant", (2.0, 2.0, 2.0), placed(0, 0, 0))
     high.world_from_light[:3, :3] = [[1, 0, 0], [0, 0.6, 0.8], [0, -0.8, 0.6]]
     scene, asked = lit([high], device)

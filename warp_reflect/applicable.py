@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -128,43 +129,99 @@ def far_environment(
     return Candidate("environment", reason, work)
 
 
+@dataclass(frozen=True)
+class _Box:
+    """A part's own, scene frame: its middle, and half its edges by length, the longest last."""
+
+    centre: np.ndarray
+    extents: np.ndarray
+
+
+def _box(scene: Scene, part: PartRange) -> _Box:
+    def make() -> _Box:
+        if part.is_whole:
+            mine = scene.host_points[part.first_vertex : part.first_vertex + part.vertex_count]
+        else:
+            own = scene.host_triangles[part.first_triangle : part.first_triangle + part.triangle_count]
+            mine = scene.host_points[own.ravel()]
+        low, high = (each.astype(np.float64) for each in (mine.min(axis=0), mine.max(axis=0)))
+        return _Box(0.5 * (low + high), np.sort(0.5 * (high - low)))
+
+    return scene.kept("box", None, make, part)
+
+
+@dataclass(frozen=True)
+class _Tried:
+    """Triangles that are asked how they bend: numbers, longest edges squared, middles [3, n], scene frame."""
+
+    ids: np.ndarray
+    longest: np.ndarray
+    middle: np.ndarray
+
+
+def _tried(scene: Scene, still: bool) -> _Tried:
+    """Those that stand still, at all times the same, or the others."""
+
+    def make_ids() -> list[np.ndarray]:
+        ids = np.arange(0, scene.triangle_count, -(-scene.triangle_count // BENT_TRIANGLES))
+        stands = np.array([not each.moves for each in scene.data.instances])
+        prims = np.array([part.prim for part in scene.parts])
+        firsts = np.array([part.first_triangle for part in scene.parts])
+        is_still = stands[prims - 1][np.searchsorted(firsts, ids, side="right") - 1]
+        return [ids[~is_still], ids[is_still]]
+
+    def make() -> _Tried:
+        ids = scene.kept_always("triangles to bend", make_ids)[still]
+        corners = scene.host_points[scene.host_triangles[ids]].astype(np.float64)
+        edges = np.stack([corners[:, k] - corners[:, k - 1] for k in range(3)])
+        return _Tried(ids, np.sum(edges**2, axis=2).max(axis=0), corners.sum(axis=1).T / 3.0)
+
+    return scene.kept_always("still triangles bend", make) if still else scene.kept("triangles bend", None, make)
+
+
 def _bends(scene: Scene, part: PartRange, camera: Camera, pixels: int) -> tuple[float, ...]:
     """`Work.bends` of a mirror as if it were a ball of its box's size, by some of the scene's triangles.
 
-    The estimate of `vertices.edge_reach`; what the body hides is left out, and of a mirror that is partly seen the part not
-    seen.
+    Of a mirror that is partly seen the part not seen is left out. What stands still is counted again where the mirror or the
+    camera has moved alone.
     """
-    if part.is_whole:
-        mine = scene.host_points[part.first_vertex : part.first_vertex + part.vertex_count].astype(np.float64)
-    else:
-        own = scene.host_triangles[part.first_triangle : part.first_triangle + part.triangle_count]
-        mine = scene.host_points[np.unique(own)].astype(np.float64)
-    low, high = mine.min(axis=0), mine.max(axis=0)
-    extents = np.sort(0.5 * (high - low))
-    size, centre = extents[2], 0.5 * (low + high)
+    box = _box(scene, part)
+    size = box.extents[2]
     if not size > 0.0:
         return ()
-    ids = np.arange(0, scene.triangle_count, -(-scene.triangle_count // BENT_TRIANGLES))
-    share = scene.triangle_count / len(ids)
-    ids = ids[(ids < part.first_triangle) | (ids >= part.first_triangle + part.triangle_count)]
-    corner = [(scene.host_points[each] - centre) / size for each in scene.host_triangles[ids].T]
-    longest = np.sqrt(np.max([np.sum((corner[k] - corner[k - 1]) ** 2, axis=1) for k in range(3)], axis=0))
-    middle = sum(corner) / 3.0
-    eye = (camera.eye - scene.origin - centre) / size
-    eye_far, far = np.linalg.norm(eye), np.linalg.norm(middle, axis=1)
-    cosine = middle @ eye / np.maximum(eye_far * far, 1.0e-30)
-    hidden = (cosine < 0.0) & ((1.0 - cosine**2) * far**2 < HIDDEN_SHARE**2)
-    radius = float(np.cbrt(np.prod(extents / size)))
+    seen_from = *camera.eye, camera.fx, camera.fy
+    count = partial(_counted, scene, part, box, camera)
+    bends = scene.kept("bends of what stands still", seen_from, lambda: count(True), part)
+    bends = bends + scene.kept(("bends of what moves", part.first_triangle), seen_from, lambda: count(False))
+    far_squared = np.sum((camera.eye - scene.origin - box.centre) ** 2)
+    whole = math.pi * box.extents[1] * size * camera.fx * camera.fy / far_squared
+    share = scene.triangle_count / sum(len(_tried(scene, still).ids) for still in (False, True))
+    return tuple((share * min(1.0, pixels / whole) * bends).tolist())
+
+
+def _counted(scene: Scene, part: PartRange, box: _Box, camera: Camera, still: bool) -> np.ndarray:
+    """Triangles tried by `Work.bends`, which stand still or do not; the mirror's own and what its body hides are left out.
+
+    The estimate of `vertices.edge_reach`, in units of the mirror's size.
+    """
+    tried, size = _tried(scene, still), box.extents[2]
+    others = (tried.ids < part.first_triangle) | (tried.ids >= part.first_triangle + part.triangle_count)
+    eye = (camera.eye - scene.origin - box.centre) / size
+    eye_far = np.linalg.norm(eye)
+    x, y, z = (tried.middle - box.centre[:, None]) / size
+    far_squared = x * x + y * y + z * z
+    far = np.sqrt(far_squared)
+    cosine = (x * eye[0] + y * eye[1] + z * eye[2]) / np.maximum(eye_far * far, 1.0e-30)
+    hidden = (cosine < 0.0) & ((1.0 - cosine * cosine) * far_squared < HIDDEN_SHARE**2)
+    radius = float(np.cbrt(np.prod(box.extents / size)))
     d_o, d_v = max(eye_far - radius, NEAREST), np.maximum(far - radius, NEAREST)
-    incidence = np.sqrt(np.maximum(0.5 * (1.0 + cosine), NEAREST**2))
-    least = incidence**2 * (1.0 / d_o + 1.0 / d_v) + 2.0 * incidence
-    focal = math.sqrt(camera.fx * camera.fy)
-    wanted = longest * np.sqrt(CUT_SLACK * focal) / (d_v * np.sqrt(float(ESTIMATE) * d_o * least))
-    whole = math.pi * extents[1] * size * camera.fx * camera.fy / (size * eye_far) ** 2
-    share *= min(1.0, pixels / whole)
-    steps = np.floor(BENDS_PER_OCTAVE * np.log2(np.maximum(wanted[~hidden], 1.0e-9) / BEND_LEAST))
-    steps = np.minimum(steps[steps >= 0.0], BENDS - 1.0).astype(np.int64)
-    return tuple(float(count) for count in share * np.bincount(steps, minlength=BENDS))
+    squared = np.maximum(0.5 * (1.0 + cosine), NEAREST**2)  # cosine of the incidence
+    least = squared * (1.0 / d_o + 1.0 / d_v) + 2.0 * np.sqrt(squared)
+    scale = CUT_SLACK * math.sqrt(camera.fx * camera.fy) / (size * size * float(ESTIMATE) * d_o * BEND_LEAST**2)
+    wanted = scale * tried.longest / (d_v * d_v * least)  # pieces, squared, over the fewest counted
+    counted = others & ~hidden & (wanted >= 1.0)
+    steps = np.minimum(0.5 * BENDS_PER_OCTAVE * np.log2(wanted[counted]), BENDS - 1.0).astype(np.int64)
+    return np.bincount(steps, minlength=BENDS)
 
 
 def _size_px(pixels: int) -> float:
@@ -182,11 +239,10 @@ def _relative_size(scene: Scene, part: int) -> float:
 
 def _measured_size(scene: Scene, part: int) -> float:
     own = scene.parts[part]
-    faces = scene.host_triangles[own.first_triangle : own.first_triangle + own.triangle_count]
-    points = scene.host_points[np.unique(faces)].astype(np.float64)
-    if not len(points):
+    if not own.triangle_count:
         return 0.0
-    centre, radius = 0.5 * (points.min(axis=0) + points.max(axis=0)), 0.5 * float(np.ptp(points, axis=0).max())
+    low, high = _span(scene, own)
+    centre, radius = 0.5 * (low + high), 0.5 * float((high - low).max())
     first, _, corners = scene.boxes
     others = corners[first != own.first_vertex]
     if not len(others):
@@ -194,3 +250,14 @@ def _measured_size(scene: Scene, part: int) -> float:
     low, high = others[:, 0], others[:, 7]
     distance = np.linalg.norm(np.maximum(np.maximum(low - centre, centre - high), 0.0), axis=1).min()
     return radius / distance if distance > 0.0 else math.inf
+
+
+def _span(scene: Scene, part: PartRange) -> tuple[np.ndarray, np.ndarray]:
+    """Least and largest coordinates of a part's triangles, scene frame, float64."""
+
+    def make() -> tuple[np.ndarray, np.ndarray]:
+        own = scene.host_triangles[part.first_triangle : part.first_triangle + part.triangle_count]
+        corners = scene.host_points[own.ravel()]
+        return corners.min(axis=0).astype(np.float64), corners.max(axis=0).astype(np.float64)
+
+    return scene.kept("span", None, make, part)

@@ -333,14 +333,16 @@ def met_kernel(
 def meeting(scene: Scene, layer: ReflectionLayer, patches: np.ndarray) -> wp.array:
     """Which rays of a layer meet one of the patches, bool [patches of the scene]: ascending, see `compact.padded`."""
     if stays(scene.device):
-        key = "patches", None, patches.tobytes()
-        if key not in scene.facts:
-            scene.facts[key] = wp.array(patches.astype(np.uint8), dtype=wp.uint8, device=scene.device)
+        of_patch = scene.kept_always(
+            ("patches", patches.tobytes()),
+            lambda: wp.array(patches.astype(np.uint8), dtype=wp.uint8, device=scene.device),
+        )
         met = wp.empty(layer.pixels.count, dtype=wp.uint8, device=scene.device)
-        inputs = [layer.triangle, scene.view.triangle_patch, scene.facts[key], met]
+        inputs = [layer.triangle, scene.view.triangle_patch, of_patch, met]
         launch(met_kernel, len(met), inputs, scene.device)
         return compact.padded(met, 1)[0]
-    key = "triangles of patches", None, patches.tobytes()
-    if key not in scene.facts:
-        scene.facts[key] = np.append(patches.take(scene.host_triangle_patch), False)  # the last is that of triangle -1
-    return compact.listed(np.flatnonzero(scene.facts[key].take(layer.triangle.numpy())), scene.device)
+    of_triangle = scene.kept_always(
+        ("triangles of patches", patches.tobytes()),
+        lambda: np.append(patches.take(scene.host_triangle_patch), False),  # the last is that of triangle -1
+    )
+    return compact.listed(np.flatnonzero(of_triangle.take(layer.triangle.numpy())), scene.device)

@@ -386,23 +386,23 @@ def make_plan(
     found, clear, rough = _surfaces(scene, settings)
     if method == "none":
         found = []
-    pixels, seen = _look(scene, view, [k for k, _, _ in found], clear, settings)
+    pixels, seen = _look(scene, view, [k for k, _ in found], clear, settings)
     if launch.is_compiling() and not (settings.max_error_px or settings.budget_ms):
         # What techniques launch is told before the lights are: those are tried for as long as that is compiled. The choice may
         # yet be another one, where shadows decide it: then a module or two will have been in vain.
         ask = scene, view, settings, method
         guess = [
-            row_of(*ask, number, k, part, weight, pixels[k], [], costs)
-            for number, (k, part, weight) in enumerate(found, 1)
+            row_of(*ask, number, k, scene.parts[k], weight, pixels[k], [], costs)
+            for number, (k, weight) in enumerate(found, 1)
         ]
         kernels.begin(kernels.of_plan(Plan(*ask, guess, [], [], [], costs)), scene.device)
-    tried, lights = _tried(scene, seen, pixels, [k for k, _, _ in found], settings, costs)
+    tried, lights = _tried(scene, seen, pixels, [k for k, _ in found], settings, costs)
     # What techniques draw themselves is shadowed where the picture is.
     cast = shadows_of(lights, settings)
     drawn = settings.replace(shadows=cast is not None and cast.direct)
     rows = [
-        row_of(scene, view, drawn, method, number, part_index, part, weight, pixels[part_index], notes, costs)
-        for number, (part_index, part, weight) in enumerate(found, 1)
+        row_of(scene, view, drawn, method, number, k, scene.parts[k], weight, pixels[k], notes, costs)
+        for number, (k, weight) in enumerate(found, 1)
     ]
     alone = len(rows) == 1 and rows[0].reflector.convex
     for row in rows:
@@ -505,15 +505,17 @@ def _too_rough(scene: Scene, settings: Settings, weights: dict[int, float]) -> l
     return list(dict.fromkeys(notes))
 
 
-def _surfaces(scene: Scene, settings: Settings) -> tuple[list[tuple[int, PartRange, float]], list[int], list[Note]]:
-    """((part, its range, its weight) of every mirror; the transparent parts; `_too_rough`); kept with the scene."""
-    key = "surfaces", None, settings.reflector_max_roughness, settings.reflector_min_weight
-    if key not in scene.facts:
+def _surfaces(scene: Scene, settings: Settings) -> tuple[list[tuple[int, float]], list[int], list[Note]]:
+    """((part, its weight) of every mirror; the transparent parts; `_too_rough`): of materials alone, at any time."""
+
+    def make() -> tuple[list[tuple[int, float]], list[int], list[Note]]:
         weights = _weights(scene, settings)
-        found = [(k, part, weight) for k, part in enumerate(scene.parts) if (weight := weights.get(part.material, 0.0))]
+        found = [(k, weight) for k, part in enumerate(scene.parts) if (weight := weights.get(part.material, 0.0))]
         clear = [k for k, part in enumerate(scene.parts) if is_transparent(scene, part)]
-        scene.facts[key] = found, clear, _too_rough(scene, settings, weights)
-    return scene.facts[key]
+        return found, clear, _too_rough(scene, settings, weights)
+
+    key = "surfaces", settings.reflector_max_roughness, settings.reflector_min_weight
+    return scene.kept_always(key, make)
 
 
 def _weights(scene: Scene, settings: Settings) -> dict[int, float]:
@@ -632,15 +634,16 @@ def _tried(
     """(What is tried of what the camera sees, where lights or bounces are decided by that; the lights).
 
     A quarter of the points is enough where every light clearly casts shadows and every mirror shows a mirror; not of shapes,
-    the cost of whose shadows hangs on how far their penumbras reach.
+    the cost of whose shadows hangs on how far their penumbras reach. Where no light is tried, points cost less than trying twice.
     """
     clear = [k for k in mirrors if pixels[k] >= max(settings.few_pixels, 1)]
     facing = settings.bounces > 1 and (len(mirrors) > 1 or any(not scene.body(k).convex for k in clear))
     if seen is None or not (needs_probe(scene, settings) or facing):
         return None, plan_lights(scene, None, settings, costs)
-    shapes = needs_probe(scene, settings) and any(light.kind in AREA_KINDS for light in scene.data.lights)
-    for spacing in (1,) if shapes else (2, 1):
-        tried = probe(scene, seen, settings.threads, spacing)
+    casting = needs_probe(scene, settings)
+    at_once = not casting or any(light.kind in AREA_KINDS for light in scene.data.lights)
+    for spacing in (1,) if at_once else (2, 1):
+        tried = probe(scene, seen, settings.threads, spacing, casting)
         lights = plan_lights(scene, tried, settings, costs)
         if are_clear(lights, settings) and (not facing or all(tried.mirrored.values())):
             break

@@ -49,12 +49,12 @@ class Probe:
     """Points that the eye sees, directly and in mirrors.
 
     Attributes:
-        points: Those tried.
+        points: Those tried; None where light is not tried there.
         count: Pixels, and pixels of mirrors, that they stand for.
         mirrored: By part: the share of its points that shows each reflector's part, where any is shown.
     """
 
-    points: Points
+    points: Points | None
     count: int
     mirrored: dict[int, dict[int, float]]
 
@@ -86,7 +86,7 @@ def look(
     return EyeView(gbuffer, pixels, dict(parts), timer.ms)
 
 
-def probe(scene: Scene, seen: EyeView, threads: int = 0, spacing: int = 1) -> Probe:
+def probe(scene: Scene, seen: EyeView, threads: int = 0, spacing: int = 1, lit: bool = True) -> Probe:
     """Try points on a coarse grid of what is seen, and what mirrors show there.
 
     Args:
@@ -94,6 +94,7 @@ def probe(scene: Scene, seen: EyeView, threads: int = 0, spacing: int = 1) -> Pr
         seen: Of the scene.
         threads: CPU threads; 0: one per core.
         spacing: Of the grid; 2: a quarter of the points.
+        lit: Whether light is tried at the points.
     """
     gbuffer = seen.gbuffer
     width, height = gbuffer.camera.size
@@ -102,8 +103,7 @@ def probe(scene: Scene, seen: EyeView, threads: int = 0, spacing: int = 1) -> Pr
     chosen = (rows[:, None] * width + columns).ravel().astype(np.int32)
     there = gbuffer.triangle.numpy()[chosen] >= 0
     count = width * height * float(there.mean())
-    points = points_of(scene, gbuffer, None, threads, chosen[there])
-    found = [_taken(points, slice(None))]
+    found = [_taken(points_of(scene, gbuffer, None, threads, chosen[there]), slice(None))] if lit else []
     mirrored: dict[int, dict[int, float]] = {}
     mirrors = {part: seen.pixels[id] for id, part in seen.parts.items() if seen.pixels[id].count}
     ids = gbuffer.reflector_id.numpy()[chosen]
@@ -122,10 +122,11 @@ def probe(scene: Scene, seen: EyeView, threads: int = 0, spacing: int = 1) -> Pr
             times = np.bincount(met[begin:end] + 1)[1:]
             mirrored[part] = {int(k): float(times[k]) / len(place) for k in np.flatnonzero(times)}
             count += mirrors[part].count * float((triangle[begin:end] >= 0).mean())
-        on_grid = np.concatenate([on_grid for _, on_grid in tried.values()])
-        kept = np.flatnonzero((triangle >= 0) & on_grid)
-        found.append(_taken(points_of(scene, gbuffer, shown, threads), kept))
-    return Probe(_joined(found, (width, height), scene.device), round(count), mirrored)
+        if lit:
+            on_grid = np.concatenate([on_grid for _, on_grid in tried.values()])
+            kept = np.flatnonzero((triangle >= 0) & on_grid)
+            found.append(_taken(points_of(scene, gbuffer, shown, threads), kept))
+    return Probe(_joined(found, (width, height), scene.device) if lit else None, round(count), mirrored)
 
 
 def _shown(

@@ -347,6 +347,9 @@ class Scene:
         self.fits: dict = {}  # part -> the quadric nearest to it, found by the technique that asks
         self.segmentations: dict = {}  # part -> its sheets (`segments.Segmentation`), likewise
         self.facts: dict = {}  # (what, first triangle of a part) -> what a technique found out about its shape
+        # What follows from materials, from which part has which, and from what stands still; shared by all times at which
+        # nothing but places differs.
+        self.lasting: dict = {}
         self.environments: dict = {}  # environment maps that several mirrors share, by what they were drawn with
         self.pyramids: dict = {}
         self.material_notes: list[Note] = []  # of what was met when the materials were prepared
@@ -421,12 +424,24 @@ class Scene:
         """Whether two scenes are the same arrays, seen at two times."""
         return self.view is other.view
 
-    def kept(self, what: str, given, make: Callable):
-        """What `make()` gives, made again where `given` is not what it was made for; for this time of the stage alone."""
-        known = self.facts.get((what, None))
+    def kept(self, what: str, given, make: Callable, of: PartRange | None = None):
+        """What `make()` gives, made again where `given` is not what it was made for.
+
+        Args:
+            what, given, make: Of what was made for several `given`, the last is kept.
+            of: None: for this time of the stage alone; a part: for all times until that one moves.
+        """
+        key = what, None if of is None else of.first_triangle
+        known = self.facts.get(key)
         if known is None or known[0] != given:
-            known = self.facts[what, None] = given, make()
+            known = self.facts[key] = given, make()
         return known[1]
+
+    def kept_always(self, key, make: Callable):
+        """What `make()` gives, kept in `lasting`."""
+        if key not in self.lasting:
+            self.lasting[key] = make()
+        return self.lasting[key]
 
     @cached_property
     def has_hole(self) -> np.ndarray | None:

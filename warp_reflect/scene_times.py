@@ -169,7 +169,7 @@ def _take_over(scene: Scene, earlier: Scene, moved: list[int], parts: list[int])
             vars(scene)[name] = known[name]
     scene.bodies = {k: body for k, body in earlier.bodies.items() if k not in gone}
     scene.bodies_in_place = {key: body for key, body in earlier.bodies_in_place.items() if key[0] not in bent}
-    scene.pyramids = earlier.pyramids
+    scene.pyramids, scene.lasting = earlier.pyramids, earlier.lasting
     scene.seen = dict(earlier.seen)
     scene.fits = {k: fit for k, fit in earlier.fits.items() if k not in gone}
     scene.segmentations = {k: found for k, found in earlier.segmentations.items() if k not in gone}

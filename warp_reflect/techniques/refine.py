@@ -286,14 +286,14 @@ def doubt_unsure(
     """Set `settled` to DOUBT where a layer shows what may have holes, or what `Scene.seen_in` leaves out."""
     if seen is None and scene.has_hole is None:
         return
-    key = "unsure", None, id(seen)
-    if key not in scene.facts:
+    key = "unsure", id(seen)
+    if key not in scene.lasting:
         unsure = np.zeros(scene.triangle_count, np.uint8) if seen is None else ~seen
         if scene.has_hole is not None:
             unsure = unsure | scene.has_hole
         # With what it was made from, which so keeps its id.
-        scene.facts[key] = seen, wp.array(unsure.astype(np.uint8), dtype=wp.uint8, device=scene.device)
-    launch(doubt_kernel, len(settled), [layer.triangle, scene.facts[key][1], settled], scene.device, threads)
+        scene.lasting[key] = seen, wp.array(unsure.astype(np.uint8), dtype=wp.uint8, device=scene.device)
+    launch(doubt_kernel, len(settled), [layer.triangle, scene.lasting[key][1], settled], scene.device, threads)
 
 
 def in_doubt_of_holes(scene: Scene, layer: ReflectionLayer, threads: int) -> wp.array | None:
