@@ -24,9 +24,10 @@ from warp_reflect.techniques.vertices import SolveFrame, VertexView, edge_reach,
 wp.set_module_options({"enable_backward": False})
 
 # Sines. Of the residual at which a search stops where no tolerance is set: the float32 floor of the residual is
-# 4e-8 to 3e-7, and 0.1 h^2 is the map's own error at texel size h.
+# 4e-8 to 3e-7, and 0.1 h^2 is the map's own error at texel size h. A picture of 1280 pixels lies up to some 1200 pixels times
+# the residual from where it would be without: in all but a hundredth of a stage's vertices a hundredth of a pixel at most.
 TOLERANCE_MIN = 2.0e-6
-TOLERANCE_MAX = 1.0e-5
+TOLERANCE_MAX = 8.0e-6
 ACCEPTED = wp.constant(1.0e-3)  # residual above which an answer is MAX_ITERATIONS rather than CONVERGED
 NEWTON_EVALUATIONS = 12  # cold starts need 3-6; what is left after 12 takes the coarse seed
 MIDPOINT_ITERATIONS = 9  # the paper's best setting (figure 8)
