@@ -58,7 +58,8 @@ def searched(quadric_, eye, points, device, warm=None):
     """(status, reflection points, eye-frame virtual points) of the float32 search, world frame."""
     matrix = quadric_patch.similarity(quadric_)
     camera = looking(eye, quadric_.origin)
-    frame = solve_frame(Origin, camera, matrix)
+    scene = type("At", (Origin,), {"device": device})
+    frame = solve_frame(scene, camera, matrix)
     vertices = empty_vertices(len(points), device, with_position=True)
     if warm is not None:
         wp.copy(vertices.seed, warm.seed)
@@ -70,7 +71,7 @@ def searched(quadric_, eye, points, device, warm=None):
         0,
         quadric_patch.device_view(quadric_),
         frame,
-        camera.view(Origin),
+        camera.view(scene),
         int(warm is not None),
         vertices,
     ]

@@ -5,15 +5,8 @@ import pytest
 import warp as wp
 
 from warp_reflect import launch, raster, raster_pieces
-from warp_reflect.layers import CameraView
 
 NEAR, FAR = 0.5, 1.0e4
-
-
-def camera(width, height):
-    view = CameraView()
-    view.width, view.height, view.near, view.far = width, height, NEAR, FAR
-    return view
 
 
 def draw(corners, width, height, threads=1, box=None, mask=None, mask_value=0):
@@ -21,7 +14,7 @@ def draw(corners, width, height, threads=1, box=None, mask=None, mask_value=0):
     corners = np.asarray(corners, np.float32)
     device = "cpu"
     box = box or (0, 0, width, height)
-    target = raster.make_target(camera(width, height), box, device, mask, mask_value)
+    target = raster.make_target(raster.Picture((width, height), NEAR, FAR), box, device, mask, mask_value)
     screen = wp.array(corners.reshape(-1, 4), dtype=wp.vec4, device=device)
     index = np.arange(3 * len(corners), dtype=np.int32).reshape(-1, 3)
     raster.rasterise(target, screen, wp.array(index, dtype=wp.vec3i, device=device), threads=threads)

@@ -124,7 +124,13 @@ def test_points_are_seen_by_the_law_of_refraction(ior, height):
     view.eye, view.forward, view.near, view.far = wp.vec3(0.0, height, 0.0), wp.vec3(0.0, 0.0, -1.0), 1e-4, 1e5
     view.x_row, view.y_row = wp.vec4(300.0, 0.0, -160.0, 0.0), wp.vec4(0.0, -300.0, -90.0, 0.0)
     given = wp.array(points.astype(np.float32), dtype=wp.vec3, device="cpu")
-    frame = [view, wp.vec3(0.0, 0.0, 0.0), wp.vec3(0.0, 1.0, 0.0), height, ior]
+    frame = [
+        wp.array([view], dtype=CameraView, device="cpu"),
+        wp.vec3(0.0, 0.0, 0.0),
+        wp.vec3(0.0, 1.0, 0.0),
+        height,
+        ior,
+    ]
     screens = [wp.zeros(333, dtype=wp.vec4, device="cpu") for _ in range(2)]
     launch(refraction_image.refract_vertices_kernel, 333, [given, *frame, screens[0]], "cpu")
     limits = [refraction_image.FOOT_STEPS, refraction_image.FOOT_DIGITS]

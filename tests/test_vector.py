@@ -14,7 +14,7 @@ import warp_reflect as wr
 from warp_reflect import raster, raster_vector, reflector_maps, surface, surface_vector, vector
 from warp_reflect.launch import launch
 from warp_reflect.layers import Camera, CameraView, MirrorPixels
-from warp_reflect.raster import make_target, rasterise
+from warp_reflect.raster import Picture, make_target, rasterise
 from warp_reflect.scene import CameraData, InstanceData, LightData, MaterialData, Scene, SceneData
 from warp_reflect.techniques import grid, map_search, quadric_patch, refine, reflector_map
 from warp_reflect.techniques.interpolation import ChunkView
@@ -26,13 +26,11 @@ CPU = wp.get_device("cpu")
 
 
 def target_of(width, height, rays=None, mask=None):
-    view = CameraView()
-    view.width, view.height = width, height
-    view.near, view.far = 1.0e-3, 1.0e3
+    picture = Picture((width, height), near=1.0e-3, far=1.0e3)
     if mask is None:
-        target = make_target(view, (0, 0, width, height), CPU)
+        target = make_target(picture, (0, 0, width, height), CPU)
     else:
-        target = make_target(view, (0, 0, width, height), CPU, wp.array(mask.reshape(-1), dtype=int, device=CPU), 1)
+        target = make_target(picture, (0, 0, width, height), CPU, wp.array(mask.reshape(-1), dtype=int, device=CPU), 1)
     if rays is not None:
         target.view.ray = wp.array(rays, dtype=wp.vec4, device=CPU)
     return target
@@ -192,12 +190,14 @@ def test_cells_without_a_ray_hold_zeros(shape, monkeypatch):
     arrays = [wp.array(each, dtype=wp.vec3, device=CPU) for each in (point, direction, direction)]
     pixels = MirrorPixels(1, wp.array(pixel, dtype=int, device=CPU), arrays[0], arrays[1], arrays[2], box)
     view = CameraView()
-    view.width, view.height, view.near, view.far, view.forward = *size, 1.0e-3, 1.0e3, wp.vec3(0.0, 0.0, -1.0)
+    view.width, view.height, view.forward = *size, wp.vec3(0.0, 0.0, -1.0)
+    view = wp.array([view], dtype=CameraView, device=CPU)
+    picture = Picture(size, near=1.0e-3, far=1.0e3)
     stale = lambda count, dtype, device: wp.array(np.full((count, 4), np.nan, np.float32), dtype=dtype, device=device)  # noqa: E731
     monkeypatch.setattr(wp, "empty", stale)
     images = {}
     for kernels, threads in (("plain", 1), ("plain", 2), ("vector", 1), ("vector", 2)):
-        target = make_target(view, box, CPU)
+        target = make_target(picture, box, CPU)
         raster.attach_rays(target, view, pixels, threads, kernels)
         images[kernels, threads] = target.view.ray.numpy().reshape(box[3] - box[1], box[2] - box[0], 8)
     there = inside[box[1] : box[3], box[0] : box[2]]
@@ -267,13 +267,14 @@ def test_vertices_are_projected_bit_for_bit(orthographic):
     view.orthographic, view.near, view.far = orthographic, 0.5, 40.0
     view.eye, view.forward = wp.vec3(1.0, 2.0, -0.5), wp.vec3(0.0, 0.6, 0.8)
     view.x_row, view.y_row = wp.vec4(300.0, 20.0, -4.0, 7.0), wp.vec4(1.0, -250.0, 90.0, 0.3)
+    camera = wp.array([view], dtype=CameraView, device=CPU)
     for count in (1, 63, 64, 65, 1001):
         places = rng.normal(size=(count, 3)).astype(np.float32) * 5.0
         places[::7] = np.array(view.eye)
         points = wp.array(places, dtype=wp.vec3, device=CPU)
         plain, vectors = (wp.zeros(count, dtype=wp.vec4, device=CPU) for _ in range(2))
-        launch(raster.project_kernel, count, [points, view, plain], CPU, 1)
-        vector.launch_blocks(raster_vector.project_blocks_kernel, count, [points, view, vectors], CPU, 2)
+        launch(raster.project_kernel, count, [points, camera, plain], CPU, 1)
+        vector.launch_blocks(raster_vector.project_blocks_kernel, count, [points, camera, vectors], CPU, 2)
         assert (plain.numpy()[:, 2] == 0.0).any()
         np.testing.assert_array_equal(vectors.numpy().view(np.uint32), plain.numpy().view(np.uint32))
 
@@ -416,7 +417,7 @@ BODIES = {
 
 
 def looking_at_origin(eye):
-    """(SolveFrame, CameraView) of a unit frame that is the scene's."""
+    """(SolveFrame, CameraView [1]) of a unit frame that is the scene's."""
     frame = SolveFrame()
     frame.unit_from_scene = frame.eye_from_unit = wp.mat33(np.eye(3, dtype=np.float32))
     frame.eye = wp.vec3(*eye)
@@ -424,7 +425,7 @@ def looking_at_origin(eye):
     forward = -np.float64(eye) / np.linalg.norm(eye)
     camera.forward, camera.near, camera.far = wp.vec3(*forward), 1e-3, 1e3
     camera.x_row, camera.y_row = wp.vec4(300.0, 0.0, 20.0, 0.0), wp.vec4(0.0, 280.0, -30.0, 0.0)
-    return frame, camera
+    return frame, wp.array([camera], dtype=CameraView, device=CPU)
 
 
 def searched(body, points, eye, kernels, threads=1, seeds=None):

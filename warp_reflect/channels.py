@@ -58,7 +58,7 @@ POINTS = ("mirrorPoint", "reflectedPoint")  # world points, known relative to th
 def reflection_channels_kernel(
     first: int,
     scene: SceneView,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     method: int,
     # Mirror pixels:
     pixel: wp.array(dtype=int),
@@ -84,8 +84,8 @@ def reflection_channels_kernel(
     """One thread per mirror pixel of a layer; points relative to the eye."""
     i = first + wp.tid()
     p = pixel[i]
-    row = p / camera.width
-    mirror = point[i] - camera.eye
+    row = p / camera[0].width
+    mirror = point[i] - camera[0].eye
     out_mirror_point[p] = mirror
     out_status[p] = float(int(status[i]))
     out_method[p] = float(method)
@@ -97,8 +97,8 @@ def reflection_channels_kernel(
         corners = scene.triangles[triangle[i]]
         weight = 1.0 - u[i] - v[i]
         shown = weight * scene.points[corners[0]] + u[i] * scene.points[corners[1]] + v[i] * scene.points[corners[2]]
-        reflected = shown - camera.eye
-    origin = eye_ray_origin(camera, float(p - row * camera.width) + 0.5, float(row) + 0.5)
+        reflected = shown - camera[0].eye
+    origin = eye_ray_origin(camera[0], float(p - row * camera[0].width) + 0.5, float(row) + 0.5)
     out_reflected_point[p] = reflected
     out_reflected_id[p] = float(scene.patches[scene.triangle_patch[triangle[i]]].prim)
     out_path_length[p] = wp.length(mirror - origin) + wp.length(reflected - mirror)

@@ -69,7 +69,8 @@ class Points:
         direction: vec3 [n], unit, of the ray that sees it.
         pixel: int32 [n], which pixel of the image; length 0: all of them in order.
         width, height: Of the image. [pixels]
-        camera: Where u, v and direction have length 0: what the eye sees, by kernels that find them themselves.
+        camera: `CameraView` [1], where u, v and direction have length 0: what the eye sees, by kernels that find them
+            themselves.
     """
 
     triangle: wp.array
@@ -79,7 +80,7 @@ class Points:
     pixel: wp.array
     width: int
     height: int
-    camera: CameraView | None = None
+    camera: wp.array | None = None
 
 
 def prepare_direct(lights: list[LightData], origin: np.ndarray, device) -> DirectView:
@@ -244,7 +245,7 @@ def area_irradiance(area: AreaView, p: wp.vec3, n: wp.vec3) -> float:
 def eye_weights_kernel(
     first: int,
     scene: SceneView,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     triangle: wp.array(dtype=int),
     pixel: wp.array(dtype=int),
     # Outputs:
@@ -260,17 +261,17 @@ def eye_weights_kernel(
     p = i
     if pixel.shape[0] > 0:
         p = pixel[i]
-    row = p // camera.width
-    x = float(p - row * camera.width) + 0.5
+    row = p // camera[0].width
+    x = float(p - row * camera[0].width) + 0.5
     y = float(row) + 0.5
-    ray = eye_ray_direction(camera, x, y)
+    ray = eye_ray_direction(camera[0], x, y)
     corner = scene.triangles[tri]
     hit = intersect_triangle(
-        eye_ray_origin(camera, x, y),
+        eye_ray_origin(camera[0], x, y),
         ray,
-        scene.points[corner[0]] - camera.eye,
-        scene.points[corner[1]] - camera.eye,
-        scene.points[corner[2]] - camera.eye,
+        scene.points[corner[0]] - camera[0].eye,
+        scene.points[corner[1]] - camera[0].eye,
+        scene.points[corner[2]] - camera[0].eye,
     )
     weights = clamp_weights(hit.u, hit.v)
     out_direction[i] = unit(ray)

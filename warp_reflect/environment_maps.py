@@ -261,7 +261,7 @@ def texel_distance(maps: CubeMapsView, k: int, index: int) -> float:
 def texel_hits_kernel(
     first: int,
     scene: SceneView,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     triangle: wp.array(dtype=int),
     # Outputs:
     out_point: wp.array(dtype=wp.vec3),
@@ -272,22 +272,22 @@ def texel_hits_kernel(
 ):
     """One thread per texel of a face: what its ray meets."""
     i = first + wp.tid()
-    row = i / camera.width
-    ray = unit(eye_ray_direction(camera, float(i - row * camera.width) + 0.5, float(row) + 0.5))
+    row = i / camera[0].width
+    ray = unit(eye_ray_direction(camera[0], float(i - row * camera[0].width) + 0.5, float(row) + 0.5))
     out_direction[i] = ray
     tri = triangle[i]
     if tri < 0:
         return
     corner = scene.triangles[tri]
-    a = scene.points[corner[0]] - camera.eye
-    b = scene.points[corner[1]] - camera.eye
-    c = scene.points[corner[2]] - camera.eye
+    a = scene.points[corner[0]] - camera[0].eye
+    b = scene.points[corner[1]] - camera[0].eye
+    c = scene.points[corner[2]] - camera[0].eye
     hit = intersect_triangle(wp.vec3(0.0, 0.0, 0.0), ray, a, b, c)
     weights = clamp_weights(hit.u, hit.v)
     if hit.det == 0.0:
         weights = wp.vec2(1.0 / 3.0, 1.0 / 3.0)
     p = (1.0 - weights[0] - weights[1]) * a + weights[0] * b + weights[1] * c
-    out_point[i] = camera.eye + p
+    out_point[i] = camera[0].eye + p
     out_u[i] = weights[0]
     out_v[i] = weights[1]
     out_distance[i] = wp.max(wp.length(p), 1.0e-30)

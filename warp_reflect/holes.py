@@ -228,7 +228,7 @@ def look_past_kernel(
     first: int,
     mesh_id: wp.uint64,
     scene: SceneView,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     # Changed:
     out_triangle: wp.array(dtype=int),
     out_depth_key: wp.array(dtype=float),
@@ -240,22 +240,22 @@ def look_past_kernel(
         return
     if scene.cuts.of_triangle[tri] < 0:
         return
-    row = i // camera.width
-    x = float(i - row * camera.width) + 0.5
+    row = i // camera[0].width
+    x = float(i - row * camera[0].width) + 0.5
     y = float(row) + 0.5
-    origin = eye_ray_origin(camera, x, y)
-    d = unit(eye_ray_direction(camera, x, y))
+    origin = eye_ray_origin(camera[0], x, y)
+    d = unit(eye_ray_direction(camera[0], x, y))
     corner = scene.triangles[tri]
-    a = scene.points[corner[0]] - camera.eye
-    b = scene.points[corner[1]] - camera.eye
-    c = scene.points[corner[2]] - camera.eye
+    a = scene.points[corner[0]] - camera[0].eye
+    b = scene.points[corner[1]] - camera[0].eye
+    c = scene.points[corner[2]] - camera[0].eye
     exact = intersect_triangle(origin, d, a, b, c)
     weights = clamp_weights(exact.u, exact.v)
     if not is_hole(scene.cuts, tri, weights[0], weights[1]):
         return
     p = (1.0 - weights[0] - weights[1]) * a + weights[0] * b + weights[1] * c
     nothing = wp.vec3(0.0, 0.0, 0.0)
-    start = camera.eye + p
+    start = camera[0].eye + p
     hit = ray_walk.RayHit()
     hit.triangle = tri
     hit.u = weights[0]
@@ -266,14 +266,14 @@ def look_past_kernel(
         holes += 1
         t0 = beyond_hole(start, d, wp.max(hit.t, t0))
         hit = ray_walk.trace_ray(mesh_id, scene, start, d, nothing, tri, ray_walk.OwnBody(), 1, t0)
-    depth = wp.dot(camera.forward, p + hit.t * d)
-    if hit.triangle < 0 or depth > camera.far:
+    depth = wp.dot(camera[0].forward, p + hit.t * d)
+    if hit.triangle < 0 or depth > camera[0].far:
         out_triangle[i] = -1
         out_depth_key[i] = 0.0
         return
     out_triangle[i] = hit.triangle
-    if camera.orthographic != 0:
-        out_depth_key[i] = 1.0 - depth / camera.far
+    if camera[0].orthographic != 0:
+        out_depth_key[i] = 1.0 - depth / camera[0].far
     else:
         out_depth_key[i] = 1.0 / depth
 

@@ -111,8 +111,11 @@ class Camera:
         mine, theirs = (replace(camera, path="") for camera in (self, other))
         return all(np.array_equal(getattr(mine, each.name), getattr(theirs, each.name)) for each in fields(mine))
 
-    def view(self, scene: Scene) -> CameraView:
-        """The device form, relative to the scene's origin."""
+    def view(self, scene: Scene) -> wp.array:
+        """The device form, `CameraView` [1], relative to the scene's origin.
+
+        It lies on the device: what is launched again sees whichever camera lies there then.
+        """
         x = self.fx * self.right
         y = -self.fy * self.up
         view = CameraView()
@@ -134,7 +137,7 @@ class Camera:
         view.near = self.near
         view.far = self.far
         view.width, view.height = self.size
-        return view
+        return wp.array([view], dtype=CameraView, device=scene.device)
 
 
 @wp.func
@@ -178,13 +181,14 @@ class GBuffer:
     """What the eye sees: per pixel the nearest triangle.
 
     Attributes:
+        camera, view: From where; the view on the device.
         triangle: int32 [height * width], -1 background.
         depth_key: float32 [height * width], see `project`; 0 background.
         reflector_id: int32 [height * width], 1-based id of the mirror seen, 0 none; set once the plan is known.
     """
 
     camera: Camera
-    view: CameraView
+    view: wp.array
     triangle: wp.array
     depth_key: wp.array
     reflector_id: wp.array | None = None

@@ -32,7 +32,7 @@ SHRINK = wp.constant(0.5)
 @wp.func
 def miss_angle(
     scene: SceneView,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     mesh_id: wp.uint64,
     first_triangle: int,
     x: float,
@@ -40,12 +40,12 @@ def miss_angle(
     target: wp.vec3,
 ) -> wp.vec4:
     """How the ray reflected at pixel coordinate (x, y) passes a point: (offset / distance, 1), or 0 off the mirror."""
-    direction = unit(eye_ray_direction(camera, x, y))
-    origin = camera.eye + eye_ray_origin(camera, x, y)
+    direction = unit(eye_ray_direction(camera[0], x, y))
+    origin = camera[0].eye + eye_ray_origin(camera[0], x, y)
     query = wp.mesh_query_ray(mesh_id, origin, direction, FAR)
     if not query.result:
         return wp.vec4(0.0, 0.0, 0.0, 0.0)
-    key = 1.0 / wp.max(query.t * wp.dot(direction, camera.forward), 1.0e-30)
+    key = 1.0 / wp.max(query.t * wp.dot(direction, camera[0].forward), 1.0e-30)
     s = surface_at(scene, camera, first_triangle + query.face, key, x, y)
     d = s.incident - 2.0 * wp.dot(s.incident, s.normal) * s.normal
     to_target = target - s.p_scene
@@ -77,7 +77,7 @@ def reflection_motion_kernel(
     v: wp.array(dtype=float),
     # The previous frame:
     before: SceneView,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     triangle_before: wp.array(dtype=int),
     mesh_id: wp.uint64,
     first_triangle: int,
@@ -99,11 +99,11 @@ def reflection_motion_kernel(
     on_mirror = intersect_triangle(
         point[i], incident, scene.points[corners[0]], scene.points[corners[1]], scene.points[corners[2]]
     )
-    start = project(camera, point_on(before, facet, on_mirror.u, on_mirror.v) - camera.eye)
+    start = project(camera[0], point_on(before, facet, on_mirror.u, on_mirror.v) - camera[0].eye)
     if on_mirror.det == 0.0 or start[2] <= 0.0:
         return
-    row = pixel[i] / camera.width
-    now = wp.vec2(float(pixel[i] - row * camera.width) + 0.5, float(row) + 0.5)
+    row = pixel[i] / camera[0].width
+    now = wp.vec2(float(pixel[i] - row * camera[0].width) + 0.5, float(row) + 0.5)
     best = wp.vec2(start[0], start[1])
     at = best
     step = wp.vec2(0.0, 0.0)

@@ -88,7 +88,7 @@ def mapped_normal(
 def eye_normals_kernel(
     first: int,
     scene: SceneView,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     textures: TextureSet,
     triangle: wp.array(dtype=int),
     reflector_id: wp.array(dtype=int),
@@ -105,20 +105,20 @@ def eye_normals_kernel(
             return
         if bumpy[reflector_id[i]] == 0:
             return
-    row = i // camera.width
-    x = float(i - row * camera.width) + 0.5
+    row = i // camera[0].width
+    x = float(i - row * camera[0].width) + 0.5
     y = float(row) + 0.5
-    ray = eye_ray_direction(camera, x, y)
+    ray = eye_ray_direction(camera[0], x, y)
     corner = scene.triangles[tri]
     hit = intersect_triangle(
-        eye_ray_origin(camera, x, y),
+        eye_ray_origin(camera[0], x, y),
         ray,
-        scene.points[corner[0]] - camera.eye,
-        scene.points[corner[1]] - camera.eye,
-        scene.points[corner[2]] - camera.eye,
+        scene.points[corner[0]] - camera[0].eye,
+        scene.points[corner[1]] - camera[0].eye,
+        scene.points[corner[2]] - camera[0].eye,
     )
     uv = clamp_weights(hit.u, hit.v)
-    width = pixel_width(camera, wp.max(hit.t, 0.0))
+    width = pixel_width(camera[0], wp.max(hit.t, 0.0))
     out_normals[i] = mapped_normal(scene, textures, tri, uv[0], uv[1], unit(ray), width)
 
 
@@ -126,7 +126,7 @@ def eye_normals_kernel(
 def mirrored_normals_kernel(
     first: int,
     scene: SceneView,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     textures: TextureSet,
     point: wp.array(dtype=wp.vec3),
     direction: wp.array(dtype=wp.vec3),
@@ -140,9 +140,9 @@ def mirrored_normals_kernel(
     i = first + wp.tid()
     if triangle[i] < 0:
         return
-    to_mirror = point[i] - camera.eye
+    to_mirror = point[i] - camera[0].eye
     longer = 1.0 + distance[i] / wp.max(wp.length(to_mirror), LEAST_LENGTH)
-    width = pixel_width(camera, wp.dot(camera.forward, to_mirror) * longer)
+    width = pixel_width(camera[0], wp.dot(camera[0].forward, to_mirror) * longer)
     out_normals[i] = mapped_normal(scene, textures, triangle[i], u[i], v[i], direction[i], width)
 
 

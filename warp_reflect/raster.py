@@ -528,11 +528,11 @@ def draw_kernel(
 
 @wp.kernel(module=PLAIN)
 def project_kernel(
-    first: int, points: wp.array(dtype=wp.vec3), camera: CameraView, out_screen: wp.array(dtype=wp.vec4)
+    first: int, points: wp.array(dtype=wp.vec3), camera: wp.array(dtype=CameraView), out_screen: wp.array(dtype=wp.vec4)
 ):
     """One thread per vertex."""
     i = first + wp.tid()
-    out_screen[i] = project(camera, points[i] - camera.eye)
+    out_screen[i] = project(camera[0], points[i] - camera[0].eye)
 
 
 @wp.func
@@ -545,7 +545,7 @@ def ray_cell(camera: CameraView, pixel: int, x0: int, y0: int, box_width: int) -
 @wp.kernel(module=RAYS)
 def ray_image_kernel(
     first: int,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     pixel: wp.array(dtype=int),
     point: wp.array(dtype=wp.vec3),
     direction: wp.array(dtype=wp.vec3),
@@ -559,27 +559,27 @@ def ray_image_kernel(
     Pixels ascend, and so do their cells: those up to the next one, which have no ray, are cleared.
     """
     i = first + wp.tid()
-    cell = ray_cell(camera, pixel[i], x0, y0, box_width)
+    cell = ray_cell(camera[0], pixel[i], x0, y0, box_width)
     end = out_ray.shape[0] / 2
     if i + 1 < pixel.shape[0]:
-        end = ray_cell(camera, pixel[i + 1], x0, y0, box_width)
+        end = ray_cell(camera[0], pixel[i + 1], x0, y0, box_width)
     for k in range(wp.where(i == 0, 0, cell + 1), end):
         out_ray[2 * k] = wp.vec4(0.0, 0.0, 0.0, 0.0)
         out_ray[2 * k + 1] = wp.vec4(0.0, 0.0, 0.0, 0.0)
     p = point[i]
     d = direction[i]
-    to_eye = p - camera.eye
+    to_eye = p - camera[0].eye
     distance = wp.length(to_eye)
     out_ray[2 * cell] = wp.vec4(p[0], p[1], p[2], distance)
-    out_ray[2 * cell + 1] = wp.vec4(d[0], d[1], d[2], distance / wp.max(wp.dot(camera.forward, to_eye), 1.0e-30))
+    out_ray[2 * cell + 1] = wp.vec4(d[0], d[1], d[2], distance / wp.max(wp.dot(camera[0].forward, to_eye), 1.0e-30))
 
 
 def attach_rays(
-    target: Target, camera: CameraView, pixels: MirrorPixels, threads: int = 0, kernels: str = "auto"
+    target: Target, camera: wp.array, pixels: MirrorPixels, threads: int = 0, kernels: str = "auto"
 ) -> None:
     """Give a target the reflected rays of its pixels: triangles drawn into it are ordered by exact path length.
 
-    Cells without a ray hold zeros.
+    Cells without a ray hold zeros. `camera`: `CameraView` [1].
     """
     device = target.key.device
     make = wp.empty if pixels.count else wp.zeros
@@ -608,8 +608,22 @@ def resolve_kernel(
     out_depth_key[i] = key_depth(k)
 
 
+@dataclass(frozen=True)
+class Picture:
+    """What a z-buffer asks of a camera, for pictures that have none; named as there."""
+
+    size: tuple[int, int]
+    near: float
+    far: float
+    orthographic: bool = False
+
+
 def make_target(
-    camera: CameraView, box: tuple[int, int, int, int], device, mask: wp.array | None = None, mask_value: int = 0
+    camera: Camera | Picture,
+    box: tuple[int, int, int, int],
+    device,
+    mask: wp.array | None = None,
+    mask_value: int = 0,
 ) -> Target:
     """An empty z-buffer over a pixel box of a camera's image, drawn only where `mask` equals `mask_value` (if > 0)."""
     x0, y0, x1, y1 = box
@@ -620,11 +634,11 @@ def make_target(
     view.column_first, view.column_end = x0, x1
     view.mask = mask if mask is not None else wp.zeros(1, dtype=int, device=device)
     view.mask_value = mask_value
-    view.mask_width = camera.width
+    view.mask_width = camera.size[0]
     view.key_min = 0.0 if camera.orthographic else 1.0 / camera.far
     view.near = camera.near
     view.far = camera.far
-    view.orthographic = camera.orthographic
+    view.orthographic = int(camera.orthographic)
     view.ray = none(wp.vec4, device)
     return Target(view, key, box)
 
@@ -784,7 +798,7 @@ def draw_scene(
 
 def draw_triangles(
     camera: Camera,
-    view: CameraView,
+    view: wp.array,
     points: wp.array,
     drawn: Sequence[tuple[wp.array, wp.array | int]],
     threads: int = 0,
@@ -801,7 +815,7 @@ def draw_triangles(
     """
     device = points.device
     width, height = camera.size
-    target = make_target(view, (0, 0, width, height), device)
+    target = make_target(camera, (0, 0, width, height), device)
     screen = wp.empty(len(points), dtype=wp.vec4, device=device)
     vectors = vector.chosen(kernels, device)
     if vectors:

@@ -512,7 +512,7 @@ def ray_block(
 @wp.kernel
 def ray_blocks_kernel(
     first: int,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     pixel: wp.array(dtype=int),
     point: wp.array(dtype=wp.vec3),
     direction: wp.array(dtype=wp.vec3),
@@ -522,4 +522,4 @@ def ray_blocks_kernel(
     out_ray: wp.array(dtype=wp.vec4),
 ):
     """As `raster.ray_image_kernel`, one thread per block of mirror pixels."""
-    ray_block((first + wp.tid()) * BLOCK, camera, pixel, point, direction, x0, y0, box_width, out_ray)
+    ray_block((first + wp.tid()) * BLOCK, camera[0], pixel, point, direction, x0, y0, box_width, out_ray)

@@ -507,10 +507,10 @@ def project_block(
 
 @wp.kernel
 def project_blocks_kernel(
-    first: int, points: wp.array(dtype=wp.vec3), camera: CameraView, out_screen: wp.array(dtype=wp.vec4)
+    first: int, points: wp.array(dtype=wp.vec3), camera: wp.array(dtype=CameraView), out_screen: wp.array(dtype=wp.vec4)
 ):
     """As `raster.project_kernel`, one thread per block of vertices."""
-    project_block((first + wp.tid()) * BLOCK, points, camera, out_screen)
+    project_block((first + wp.tid()) * BLOCK, points, camera[0], out_screen)
 
 
 @wp.func_native(

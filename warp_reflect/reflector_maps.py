@@ -16,8 +16,7 @@ from warp_reflect.baked_maps import BakedMap
 from warp_reflect.bodies import CLOSING_POWER, Sheet, analyse, fit_sheet, weld
 from warp_reflect.cubemap import FACE_COUNT, cube_point, face_axes, node_directions
 from warp_reflect.launch import launch
-from warp_reflect.layers import CameraView
-from warp_reflect.raster import make_target, rasterise, resolve_kernel
+from warp_reflect.raster import Picture, make_target, rasterise, resolve_kernel
 from warp_reflect.segments import COSINE_MIN, OVERHANG_MAX
 
 wp.set_module_options({"enable_backward": False})
@@ -406,16 +405,13 @@ def _draw_faces(whitened: np.ndarray, faces: np.ndarray, resolution: int, closed
     n = resolution
     half = 0.5 * (n - 1)
     triangles = wp.array(faces, dtype=wp.vec3i, device="cpu")
+    picture = Picture((n, n), near=1.0e-6, far=1.0e6)
     result = np.empty((FACE_COUNT, n * n), np.int64)
     for face in range(FACE_COUNT):
         k, ku, kv, sign = face_axes(face)
-        camera = CameraView()
-        camera.width = camera.height = n
-        camera.near = 1.0e-6
-        camera.far = 1.0e6
         depth = sign * whitened[:, k]
         screen = np.zeros((len(whitened), 4), np.float32)
-        front = depth > camera.near
+        front = depth > picture.near
         safe = np.where(front, depth, 1.0)
         x = half * whitened[:, ku] + 0.5 * n * depth
         y = half * whitened[:, kv] + 0.5 * n * depth
@@ -423,7 +419,7 @@ def _draw_faces(whitened: np.ndarray, faces: np.ndarray, resolution: int, closed
         screen[:, 1] = np.where(front, y / safe, y)
         screen[:, 2] = np.where(front, 1.0 / safe, 0.0)
         screen[:, 3] = depth
-        target = make_target(camera, (0, 0, n, n), "cpu")
+        target = make_target(picture, (0, 0, n, n), "cpu")
         rasterise(target, wp.array(screen, dtype=wp.vec4, device="cpu"), triangles)
         drawn = wp.empty(n * n, dtype=int, device="cpu")
         launch(resolve_kernel, n * n, [target.key, drawn, wp.empty(n * n, dtype=float, device="cpu")], "cpu")

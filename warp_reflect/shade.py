@@ -400,7 +400,7 @@ def hit_radiance(
 def shade_kernel(
     first: int,
     scene: SceneView,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     lights: LightView,
     looks: wp.array(dtype=Look),
     normals: wp.array(dtype=wp.vec3),
@@ -414,18 +414,18 @@ def shade_kernel(
 ):
     """One thread per pixel: all but the mirror term of reflectors, whose weight is left in `out_mirror`."""
     i = first + wp.tid()
-    row = i // camera.width
-    x = float(i - row * camera.width) + 0.5
+    row = i // camera[0].width
+    x = float(i - row * camera[0].width) + 0.5
     y = float(row) + 0.5
     tri = triangle[i]
-    incident = unit(eye_ray_direction(camera, x, y))
+    incident = unit(eye_ray_direction(camera[0], x, y))
     base = wp.vec3(0.0, 0.0, 0.0)
     weight = wp.vec3(1.0, 1.0, 1.0)
     onward = incident
     reflector = reflector_id[i] > 0
     coverage = float(0.0)
     if tri >= 0:
-        uv = weights_seen(scene, camera, tri, x, y)
+        uv = weights_seen(scene, camera[0], tri, x, y)
         n = shown_normal(normals, i, hit_normal(scene, tri, uv[0], uv[1]))
         cosine = wp.dot(n, incident)
         onward = incident - 2.0 * cosine * n

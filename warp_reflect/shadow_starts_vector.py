@@ -6,6 +6,8 @@ are found on the way. Shapes that are no spheres are left to the plain function.
 
 from __future__ import annotations
 
+from functools import cache
+
 import warp as wp
 
 from warp_reflect import vector
@@ -154,7 +156,7 @@ def starts_blocks_kernel(
     of_eye: int,
     scene: SceneView,
     records: wp.array(dtype=float),
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     lights: DirectView,
     triangle: wp.array(dtype=int),
     weight_u: wp.array(dtype=float),
@@ -173,7 +175,7 @@ def starts_blocks_kernel(
         of_eye,
         scene,
         records,
-        camera,
+        camera[0],
         lights,
         triangle,
         weight_u,
@@ -210,6 +212,12 @@ def flat_irradiance_kernel(
             out_unshadowed[k, i] = area_irradiance(lights.areas[k], p, n)
 
 
+@cache
+def _no_camera(device: str) -> wp.array:
+    """Stands for the camera where nobody looks at it: kernels take it out of the array before they know."""
+    return wp.zeros(1, dtype=CameraView, device=device)
+
+
 def starts_of(
     scene: Scene,
     points: Points,
@@ -227,7 +235,7 @@ def starts_of(
     if flat:
         rows = rows_in(room, int(ROWS) + PLACE_ROWS, rows.shape[1], device)
         starts.rows = rows
-    camera = CameraView() if points.camera is None else points.camera
+    camera = _no_camera(str(device)) if points.camera is None else points.camera
     at = [points.triangle, points.u, points.v, points.direction, normals, points.pixel, width]
     inputs = [int(points.camera is not None), scene.view, scene.triangle_records, camera, lights, *at]
     vector.launch_blocks(starts_blocks_kernel, count, [*inputs, rows, starts.unshadowed], device, threads)

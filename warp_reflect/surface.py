@@ -173,7 +173,9 @@ def polish(scene: SceneView, triangle: int, p: wp.vec3, direction: wp.vec3) -> w
 
 
 @wp.func
-def surface_at(scene: SceneView, camera: CameraView, triangle: int, depth_key: float, x: float, y: float) -> Surface:
+def surface_at(
+    scene: SceneView, camera: wp.array(dtype=CameraView), triangle: int, depth_key: float, x: float, y: float
+) -> Surface:
     """The surface that the eye sees at pixel coordinate (x, y) on a triangle of the G-buffer.
 
     A polished point is the pixel ray's own; the facet, or in perspective the depth key alone, tells where to
@@ -182,12 +184,12 @@ def surface_at(scene: SceneView, camera: CameraView, triangle: int, depth_key: f
     direction is the one to the point.
     """
     result = Surface()
-    direction = eye_ray_direction(camera, x, y)
+    direction = eye_ray_direction(camera[0], x, y)
     incident = unit(direction)
     shape = scene.patches[scene.triangle_patch[triangle]].shape
-    if shape == SHAPE_QUADRIC and camera.orthographic == 0:
+    if shape == SHAPE_QUADRIC and camera[0].orthographic == 0:
         p = direction / depth_key
-        start = camera.eye + p
+        start = camera[0].eye + p
         polished = polish(scene, triangle, start, incident)
         n = wp.vec3(polished[0], polished[1], polished[2])
         if n[0] != 0.0 or n[1] != 0.0 or n[2] != 0.0:
@@ -204,10 +206,10 @@ def surface_at(scene: SceneView, camera: CameraView, triangle: int, depth_key: f
     v0 = scene.points[tri[0]]
     v1 = scene.points[tri[1]]
     v2 = scene.points[tri[2]]
-    a = v0 - camera.eye
-    b = v1 - camera.eye
-    c = v2 - camera.eye
-    hit = intersect_triangle(eye_ray_origin(camera, x, y), direction, a, b, c)
+    a = v0 - camera[0].eye
+    b = v1 - camera[0].eye
+    c = v2 - camera[0].eye
+    hit = intersect_triangle(eye_ray_origin(camera[0], x, y), direction, a, b, c)
     weights = clamp_weights(hit.u, hit.v)
     if hit.det == 0.0:
         weights = wp.vec2(1.0 / 3.0, 1.0 / 3.0)
@@ -216,10 +218,10 @@ def surface_at(scene: SceneView, camera: CameraView, triangle: int, depth_key: f
     w = 1.0 - u - v
     result.p_scene = w * v0 + u * v1 + v * v2
     result.p_eye = w * a + u * b + v * c
-    if camera.orthographic == 0:
+    if camera[0].orthographic == 0:
         incident = unit(result.p_eye)
     n = shading_normal(scene, triangle, u, v, facet_normal(a, b, c))
-    if shape == SHAPE_PLANE or (shape == SHAPE_QUADRIC and camera.orthographic != 0):
+    if shape == SHAPE_PLANE or (shape == SHAPE_QUADRIC and camera[0].orthographic != 0):
         polished = polish(scene, triangle, result.p_scene, incident)
         if polished[0] != 0.0 or polished[1] != 0.0 or polished[2] != 0.0:
             n = wp.vec3(polished[0], polished[1], polished[2])
@@ -254,7 +256,7 @@ def reflector_id_kernel(
 @wp.func
 def mirror_pixel(
     scene: SceneView,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     triangle: wp.array(dtype=int),
     depth_key: wp.array(dtype=float),
     p: int,
@@ -264,8 +266,8 @@ def mirror_pixel(
     out_direction: wp.array(dtype=wp.vec3),
 ):
     """The surface at pixel p of the picture and its reflected direction, into entry i."""
-    row = p // camera.width
-    x = float(p - row * camera.width) + 0.5
+    row = p // camera[0].width
+    x = float(p - row * camera[0].width) + 0.5
     s = surface_at(scene, camera, triangle[p], depth_key[p], x, float(row) + 0.5)
     out_point[i] = s.p_scene
     out_normal[i] = s.normal
@@ -278,7 +280,7 @@ def mirror_pixel(
 def mirror_pixels_kernel(
     first: int,
     scene: SceneView,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     triangle: wp.array(dtype=int),
     depth_key: wp.array(dtype=float),
     pixel: wp.array(dtype=int),
@@ -495,7 +497,7 @@ def _sorted_by_id(ids: wp.array, wanted: Collection[int], width: int) -> dict[in
 def surface_channels_kernel(
     first: int,
     scene: SceneView,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     triangle: wp.array(dtype=int),
     depth_key: wp.array(dtype=float),
     out_depth: wp.array(dtype=float),
@@ -510,9 +512,9 @@ def surface_channels_kernel(
         out_normal[i] = wp.vec3(0.0, 0.0, 0.0)
         out_prim[i] = 0
         return
-    row = i // camera.width
-    s = surface_at(scene, camera, tri, depth_key[i], float(i - row * camera.width) + 0.5, float(row) + 0.5)
-    out_depth[i] = wp.dot(camera.forward, s.p_eye)
+    row = i // camera[0].width
+    s = surface_at(scene, camera, tri, depth_key[i], float(i - row * camera[0].width) + 0.5, float(row) + 0.5)
+    out_depth[i] = wp.dot(camera[0].forward, s.p_eye)
     out_normal[i] = s.normal
     out_prim[i] = scene.patches[scene.triangle_patch[tri]].prim
 

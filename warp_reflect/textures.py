@@ -519,7 +519,7 @@ def pixel_width(camera: CameraView, depth: float) -> float:
 def eye_looks_kernel(
     first: int,
     scene: SceneView,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     textures: TextureSet,
     triangle: wp.array(dtype=int),
     out_looks: wp.array(dtype=Look),
@@ -529,20 +529,20 @@ def eye_looks_kernel(
     tri = triangle[i]
     if tri < 0:
         return
-    row = i // camera.width
-    x = float(i - row * camera.width) + 0.5
+    row = i // camera[0].width
+    x = float(i - row * camera[0].width) + 0.5
     y = float(row) + 0.5
-    ray = eye_ray_direction(camera, x, y)
+    ray = eye_ray_direction(camera[0], x, y)
     corner = scene.triangles[tri]
     hit = intersect_triangle(
-        eye_ray_origin(camera, x, y),
+        eye_ray_origin(camera[0], x, y),
         ray,
-        scene.points[corner[0]] - camera.eye,
-        scene.points[corner[1]] - camera.eye,
-        scene.points[corner[2]] - camera.eye,
+        scene.points[corner[0]] - camera[0].eye,
+        scene.points[corner[1]] - camera[0].eye,
+        scene.points[corner[2]] - camera[0].eye,
     )
     uv = clamp_weights(hit.u, hit.v)
-    width = pixel_width(camera, wp.max(hit.t, 0.0))
+    width = pixel_width(camera[0], wp.max(hit.t, 0.0))
     out_looks[i] = look_at_point(scene, textures, tri, uv[0], uv[1], unit(ray), width)
 
 
@@ -550,7 +550,7 @@ def eye_looks_kernel(
 def mirrored_looks_kernel(
     first: int,
     scene: SceneView,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     textures: TextureSet,
     point: wp.array(dtype=wp.vec3),
     direction: wp.array(dtype=wp.vec3),
@@ -564,9 +564,9 @@ def mirrored_looks_kernel(
     i = first + wp.tid()
     if triangle[i] < 0:
         return
-    to_mirror = point[i] - camera.eye
+    to_mirror = point[i] - camera[0].eye
     longer = 1.0 + distance[i] / wp.max(wp.length(to_mirror), LEAST_LENGTH)
-    width = pixel_width(camera, wp.dot(camera.forward, to_mirror) * longer)
+    width = pixel_width(camera[0], wp.dot(camera[0].forward, to_mirror) * longer)
     out_looks[i] = look_at_point(scene, textures, triangle[i], u[i], v[i], direction[i], width)
 
 

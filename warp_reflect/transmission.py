@@ -295,7 +295,7 @@ def cross_pixel(
 def cross_seen_kernel(
     first: int,
     scene: SceneView,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     interfaces: wp.array(dtype=InterfaceView),
     looks: wp.array(dtype=Look),
     normals: wp.array(dtype=wp.vec3),
@@ -320,7 +320,7 @@ def cross_seen_kernel(
     i = first + wp.tid()
     cross_pixel(
         scene,
-        camera,
+        camera[0],
         interfaces,
         looks,
         normals,

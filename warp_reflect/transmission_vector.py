@@ -180,7 +180,7 @@ def cross_blocks_kernel(
     first: int,
     scene: SceneView,
     records: wp.array(dtype=float),
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     interfaces: wp.array(dtype=InterfaceView),
     looks: wp.array(dtype=Look),
     normals: wp.array(dtype=wp.vec3),
@@ -207,7 +207,7 @@ def cross_blocks_kernel(
         block,
         scene,
         records,
-        camera,
+        camera[0],
         interfaces,
         looks,
         normals,
@@ -234,7 +234,7 @@ def cross_blocks_kernel(
         if (left & wp.uint64(1)) != wp.uint64(0):
             cross_pixel(
                 scene,
-                camera,
+                camera[0],
                 interfaces,
                 looks,
                 normals,

@@ -104,7 +104,7 @@ def _axes(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def wave_normals_kernel(
     first: int,
     scene: SceneView,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     waves: wp.array(dtype=Wave),
     triangle: wp.array(dtype=int),
     # Pixels that show the waves:
@@ -118,18 +118,18 @@ def wave_normals_kernel(
     i = pixel[k]
     corner = scene.triangles[triangle[i]]
     outward = facet_normal(scene.points[corner[0]], scene.points[corner[1]], scene.points[corner[2]])
-    row = i // camera.width
-    d = eye_ray_direction(camera, float(i - row * camera.width) + 0.5, float(row) + 0.5)
+    row = i // camera[0].width
+    d = eye_ray_direction(camera[0], float(i - row * camera[0].width) + 0.5, float(row) + 0.5)
     facing = wp.dot(outward, d)
     if facing == 0.0:
         return
     p = point[k]
     n = normal[k]
     # How the point moves over the surface from pixel to pixel.
-    step_x = camera.ray_dx
-    step_y = camera.ray_dy
-    if camera.orthographic == 0:
-        depth = wp.dot(camera.forward, p - camera.eye)
+    step_x = camera[0].ray_dx
+    step_y = camera[0].ray_dy
+    if camera[0].orthographic == 0:
+        depth = wp.dot(camera[0].forward, p - camera[0].eye)
         step_x = depth * step_x
         step_y = depth * step_y
     step_x -= (wp.dot(outward, step_x) / facing) * d

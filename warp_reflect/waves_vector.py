@@ -120,7 +120,7 @@ def wave_blocks_kernel(
     sine_1: float,
     sine_3: float,
     sine_5: float,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     waves: wp.array(dtype=Wave),
     triangle: wp.array(dtype=int),
     # Pixels that show the waves:
@@ -140,7 +140,7 @@ def wave_blocks_kernel(
         sine_1,
         sine_3,
         sine_5,
-        camera,
+        camera[0],
         waves,
         triangle,
         pixel,

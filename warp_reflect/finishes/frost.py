@@ -57,7 +57,7 @@ def radius_at(spread_px: float, depth: float, nearness: float, camera: CameraVie
 @wp.kernel
 def divide_kernel(
     first: int,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     pixel: wp.array(dtype=int),
     point: wp.array(dtype=wp.vec3),
     nearness: wp.array(dtype=float),
@@ -67,10 +67,10 @@ def divide_kernel(
 ):
     """One thread per pixel: its share in the pictures of the octaves next to its own distance."""
     i = first + wp.tid()
-    texel = texel_of(out_pyramid, pixel[i], camera.width)
-    depth = wp.length(point[i] - camera.eye)
-    widest = radius_at(spread_px, depth, 0.0, camera, out_pyramid)
-    radius = radius_at(spread_px, depth, nearness[i], camera, out_pyramid)
+    texel = texel_of(out_pyramid, pixel[i], camera[0].width)
+    depth = wp.length(point[i] - camera[0].eye)
+    widest = radius_at(spread_px, depth, 0.0, camera[0], out_pyramid)
+    radius = radius_at(spread_px, depth, nearness[i], camera[0], out_pyramid)
     octave = wp.clamp(wp.log2(wp.max(radius / widest, 1.0e-6)) + float(OCTAVES - 1), 0.0, float(OCTAVES - 1))
     nearer = wp.min(int(octave), OCTAVES - 2)
     # So that the two discs' mean has the variance of the radius between theirs.
@@ -84,7 +84,7 @@ def divide_kernel(
 @wp.kernel
 def frost_kernel(
     first: int,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     pyramid: Pyramid,
     pixel: wp.array(dtype=int),
     point: wp.array(dtype=wp.vec3),
@@ -98,11 +98,11 @@ def frost_kernel(
     The mean of a picture's coverage over the disc that is the cone's at that distance is the share of the cone that it covers.
     """
     i = first + wp.tid()
-    row = pixel[i] // camera.width
-    x = float(pixel[i] - row * camera.width - pyramid.x0) + 0.5
+    row = pixel[i] // camera[0].width
+    x = float(pixel[i] - row * camera[0].width - pyramid.x0) + 0.5
     y = float(row - pyramid.y0) + 0.5
-    depth = wp.length(point[i] - camera.eye)
-    widest = radius_at(spread_px, depth, 0.0, camera, pyramid)
+    depth = wp.length(point[i] - camera[0].eye)
+    widest = radius_at(spread_px, depth, 0.0, camera[0], pyramid)
     mixed = wp.vec3(0.0, 0.0, 0.0)
     left = float(1.0)
     for b in range(OCTAVES):
@@ -141,7 +141,7 @@ def mean_kernel(first: int, count: int, radiance: wp.array(dtype=wp.vec3), out_r
 @wp.kernel
 def missed_kernel(
     first: int,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     pixel: wp.array(dtype=int),
     blurry: wp.array(dtype=wp.vec3),
     rays: wp.array(dtype=wp.vec3),
@@ -150,13 +150,13 @@ def missed_kernel(
     """One thread per pixel: what its rays see beside the blurred picture."""
     i = first + wp.tid()
     missed = rays[i] - blurry[i]
-    out_pyramid.color[texel_of(out_pyramid, pixel[i], camera.width)] = wp.vec4(missed[0], missed[1], missed[2], 1.0)
+    out_pyramid.color[texel_of(out_pyramid, pixel[i], camera[0].width)] = wp.vec4(missed[0], missed[1], missed[2], 1.0)
 
 
 @wp.kernel
 def correct_kernel(
     first: int,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     missed: Pyramid,
     pixel: wp.array(dtype=int),
     blurry: wp.array(dtype=wp.vec3),
@@ -168,8 +168,8 @@ def correct_kernel(
 ):
     """One thread per pixel: adds the mean of what is missed over a disc around it, between black and the brightest."""
     i = first + wp.tid()
-    row = pixel[i] // camera.width
-    x = float(pixel[i] - row * camera.width - missed.x0) + 0.5
+    row = pixel[i] // camera[0].width
+    x = float(pixel[i] - row * camera[0].width - missed.x0) + 0.5
     y = float(row - missed.y0) + 0.5
     level = level_of(missed, radius * wp.sqrt(3.0 / float(count)))
     total = look_up_level(missed, 0, x, y, level)

@@ -61,7 +61,7 @@ def shifted_radiance(picture: StillPicture, own: wp.vec2, at: wp.vec2, otherwise
 @wp.kernel
 def reflect_waves_kernel(
     first: int,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     normals: wp.array(dtype=wp.vec3),
     picture: StillPicture,
     # Mirror pixels:
@@ -74,10 +74,10 @@ def reflect_waves_kernel(
 ):
     """One thread per mirror pixel."""
     i = first + wp.tid()
-    row = pixel[i] // camera.width
-    own = wp.vec2(float(pixel[i] - row * camera.width) + 0.5, float(row) + 0.5)
+    row = pixel[i] // camera[0].width
+    own = wp.vec2(float(pixel[i] - row * camera[0].width) + 0.5, float(row) + 0.5)
     n = normal[i]
-    to_point = point[i] - camera.eye
+    to_point = point[i] - camera[0].eye
     turned = turned_reflection(direction[i], n, shown_normal(normals, pixel[i], n))
     # What the turned ray meets stands, to the eye, where its mirror image in the still plane does.
     rise = wp.dot(turned, n)
@@ -86,7 +86,7 @@ def reflect_waves_kernel(
     near = nearness_at(picture, own[0], own[1], 0.0)
     at = own
     for _step in range(MIRROR_STEPS):
-        at = seen_at(camera, to_point + behind / wp.max(near * rise, least), own)
+        at = seen_at(camera[0], to_point + behind / wp.max(near * rise, least), own)
         near = nearness_at(picture, at[0], at[1], near)
     out_radiance[i] = shifted_radiance(picture, own, at, radiance[i])
 
@@ -125,7 +125,7 @@ def crossing_point(near_it: wp.vec3, n: wp.vec3, target: wp.vec3, ior: float) ->
 @wp.kernel
 def refract_waves_kernel(
     first: int,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     normals: wp.array(dtype=wp.vec3),
     inside: wp.array(dtype=wp.uint8),
     ior: float,
@@ -141,11 +141,11 @@ def refract_waves_kernel(
     i = first + wp.tid()
     out_radiance[i] = radiance[i]
     n = -normal[i]
-    row = pixel[i] // camera.width
-    own = wp.vec2(float(pixel[i] - row * camera.width) + 0.5, float(row) + 0.5)
-    to_point = point[i] - camera.eye
-    incident = camera.forward
-    if camera.orthographic == 0:
+    row = pixel[i] // camera[0].width
+    own = wp.vec2(float(pixel[i] - row * camera[0].width) + 0.5, float(row) + 0.5)
+    to_point = point[i] - camera[0].eye
+    incident = camera[0].forward
+    if camera[0].orthographic == 0:
         incident = unit(to_point)
     # Rays that are in the body, totally reflected there, came from it.
     if int(inside[i]) == 0 or wp.dot(incident, n) >= 0.0:
@@ -155,7 +155,7 @@ def refract_waves_kernel(
         return
     bent = unit(bent)
     still = wp.vec3(0.0, 0.0, 0.0)
-    if camera.orthographic != 0:
+    if camera[0].orthographic != 0:
         still = refract(incident, n, ior)
     least = LEAST_NEARNESS / wp.max(wp.length(to_point), LEAST_DEPTH)
     near = nearness_at(picture, own[0], own[1], 0.0)
@@ -163,12 +163,12 @@ def refract_waves_kernel(
     crossing = to_point
     for _step in range(REFRACTION_STEPS):
         target = to_point - bent / wp.min(near * wp.dot(bent, n), -least)
-        if camera.orthographic == 0:
+        if camera[0].orthographic == 0:
             crossing = crossing_point(crossing, n, target, ior)
-            at = seen_at(camera, crossing, own)
+            at = seen_at(camera[0], crossing, own)
         else:
             way = wp.dot(target - to_point, n) / wp.dot(still, n)
-            at = seen_at(camera, target - way * still, own)
+            at = seen_at(camera[0], target - way * still, own)
         near = nearness_at(picture, at[0], at[1], near)
     out_radiance[i] = shifted_radiance(picture, own, at, radiance[i])
 

@@ -247,7 +247,7 @@ def reflect_block(
 @wp.kernel
 def reflect_blocks_kernel(
     first: int,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     normals: wp.array(dtype=wp.vec3),
     picture: StillPicture,
     # Mirror pixels:
@@ -261,7 +261,7 @@ def reflect_blocks_kernel(
     """One thread per block of mirror pixels."""
     reflect_block(
         first + wp.tid(),
-        camera,
+        camera[0],
         normals,
         picture,
         pixel,
@@ -364,7 +364,7 @@ def refract_block(
 @wp.kernel
 def refract_blocks_kernel(
     first: int,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     normals: wp.array(dtype=wp.vec3),
     inside: wp.array(dtype=wp.uint8),
     ior: float,
@@ -379,7 +379,7 @@ def refract_blocks_kernel(
     """One thread per block of pixels of the surface."""
     refract_block(
         first + wp.tid(),
-        camera,
+        camera[0],
         normals,
         inside,
         ior,

@@ -23,7 +23,7 @@ from warp_reflect.bodies import weld
 from warp_reflect.launch import launch
 from warp_reflect.layers import Camera, CameraView, GBuffer, MirrorPixels, ReflectionLayer, Reflector, project
 from warp_reflect.optics import mirror_point, specular_residual
-from warp_reflect.raster import make_target, rasterise, resolve_kernel
+from warp_reflect.raster import Picture, make_target, rasterise, resolve_kernel
 from warp_reflect.scene import PartRange, Scene
 from warp_reflect.segments import part_mesh
 from warp_reflect.settings import Settings, Status, Technique
@@ -192,7 +192,7 @@ def explosion_kernel(
     own_count: int,
     map: ExplosionView,
     frame: SolveFrame,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     least_curvature: float,
     out_vertex: VertexView,
 ):
@@ -209,7 +209,7 @@ def explosion_kernel(
     out_vertex.residual[i] = specular_residual(hit.p, hit.n, frame.eye, target)
     out_vertex.reach[i] = edge_reach(frame, hit.p, hit.n, target, least_curvature)
     virtual = frame.eye_from_unit * (mirror_point(target, hit.p, hit.n) - frame.eye)
-    out_vertex.screen[i] = project(camera, virtual)
+    out_vertex.screen[i] = project(camera[0], virtual)
     if out_vertex.position.shape[0] > 0:
         out_vertex.position[i] = virtual
 
@@ -330,10 +330,8 @@ def _draw_disc(direction, axes, faces, front, device) -> wp.array:
     screen = np.ones((len(direction), 4), np.float32)
     screen[:, :2] = 0.5 * DISC_NODES * (1.0 + local[:, :2] * scale[:, None])
     drawn = np.flatnonzero(front & (local[:, 2] > RIM_Z)[faces].all(axis=1)).astype(np.int32)
-    camera = CameraView()
-    camera.width = camera.height = DISC_NODES
-    camera.near, camera.far = 1.0e-3, 1.0e3
-    target = make_target(camera, (0, 0, DISC_NODES, DISC_NODES), device)
+    picture = Picture((DISC_NODES, DISC_NODES), near=1.0e-3, far=1.0e3)
+    target = make_target(picture, (0, 0, DISC_NODES, DISC_NODES), device)
     count = DISC_NODES * DISC_NODES
     disc = wp.full(count, -1, dtype=int, device=device)
     if len(drawn):

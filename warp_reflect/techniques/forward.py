@@ -141,7 +141,7 @@ def sides_kernel(
     status: wp.array(dtype=wp.uint8),
     corners: wp.array(dtype=wp.vec3i),
     boundary: wp.array(dtype=wp.vec3),
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     # Outputs:
     out_screen: wp.array(dtype=wp.vec4),
     out_triangles: wp.array(dtype=wp.vec3i),
@@ -165,7 +165,7 @@ def sides_kernel(
     for k in range(3):
         out_screen[k * n + i] = screen[corner[k]]
     for k in range(2):
-        out_screen[(3 + k) * n + i] = project(camera, boundary[k * n + i])
+        out_screen[(3 + k) * n + i] = project(camera[0], boundary[k * n + i])
         out_owners[k * n + i] = ids[i]
         out_planes[k * n + i] = triangles[ids[i]]
     if int(status[corner[0]]) == CONVERGED:
@@ -211,7 +211,7 @@ def triangle_weights(p: wp.vec3, e1: wp.vec3, e2: wp.vec3) -> wp.vec2:
 def candidate_hits_kernel(
     first: int,
     scene: SceneView,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     target: raster.TargetView,
     screen: wp.array(dtype=wp.vec4),
     # Mirror pixels:
@@ -231,8 +231,8 @@ def candidate_hits_kernel(
 ):
     """One thread per mirror pixel: the point of the virtual triangle drawn there, without refinement."""
     i = first + wp.tid()
-    x = pixel[i] % camera.width
-    y = pixel[i] / camera.width
+    x = pixel[i] % camera[0].width
+    y = pixel[i] / camera[0].width
     cell = (y - target.y0) * (target.x1 - target.x0) + x - target.x0
     drawn = raster.key_triangle(target.key[cell])
     if drawn < 0:
@@ -342,7 +342,7 @@ def reflect(
         )
         layer.history = History(mesh, vertices, camera.eye)
     with timer("virtual_raster"):
-        target = raster.make_target(gbuffer.view, pixels.box, scene.device, gbuffer.reflector_id, reflector.id)
+        target = raster.make_target(gbuffer.camera, pixels.box, scene.device, gbuffer.reflector_id, reflector.id)
         target.view.painter = int(settings.occlusion == "painter")
         if settings.refine != "off":
             raster.attach_rays(target, gbuffer.view, pixels, settings.threads, settings.kernels)

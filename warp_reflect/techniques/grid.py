@@ -22,7 +22,7 @@ import warp as wp
 
 from warp_reflect import vector
 from warp_reflect.launch import launch
-from warp_reflect.layers import Camera, CameraView
+from warp_reflect.layers import Camera
 from warp_reflect.reflector_maps import ReflectorMap
 from warp_reflect.scene import PartRange, Scene
 from warp_reflect.settings import Settings, Status
@@ -137,7 +137,7 @@ def fill(
     solve: Callable,
     frame: SolveFrame,
     map: ReflectorMap,
-    view: CameraView,
+    view: wp.array,
     camera: Camera,
     box: tuple[int, int, int, int],
     settings: Settings,

@@ -326,7 +326,7 @@ def position_kernel(
     order: wp.array(dtype=int),
     chunks: ChunkView,
     node: VertexView,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     out_vertex: VertexView,
 ):
     """One thread per chunk: virtual positions from the cell's corners."""
@@ -346,7 +346,7 @@ def position_kernel(
     for j in range(begin, end):
         if int(out_vertex.status[order[j]]) == 0:
             local = (points[j] - low) * inv
-            settle(out_vertex, order[j], camera, evaluate(position, local), reach)
+            settle(out_vertex, order[j], camera[0], evaluate(position, local), reach)
 
 
 @wp.kernel
@@ -357,7 +357,7 @@ def slope_position_kernel(
     chunks: ChunkView,
     node: VertexView,
     slope: wp.array(dtype=wp.mat33),
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     out_vertex: VertexView,
 ):
     """One thread per chunk: as `position_kernel`, with the slopes at the corners.
@@ -432,7 +432,7 @@ def slope_position_kernel(
             local = (points[j] - low) * inv
             q = evaluate(position, local) + local[0] * evaluate(along_x, local)
             q += local[1] * evaluate(along_y, local) + local[2] * evaluate(along_z, local)
-            settle(out_vertex, order[j], camera, q, reach)
+            settle(out_vertex, order[j], camera[0], q, reach)
 
 
 @wp.kernel
@@ -444,7 +444,7 @@ def direction_kernel(
     node: VertexView,
     map: ReflectorMapView,
     frame: SolveFrame,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     tolerance: float,
     out_vertex: VertexView,
     out_failed: wp.array(dtype=wp.uint8),
@@ -487,7 +487,7 @@ def direction_kernel(
                     out_failed[j] = wp.uint8(0)
                     out_vertex.residual[vertex] = r.residual
                     out_vertex.seed[vertex] = x
-                    settle(out_vertex, vertex, camera, virtual_vertex(frame, r.p, r.n, target), reach)
+                    settle(out_vertex, vertex, camera[0], virtual_vertex(frame, r.p, r.n, target), reach)
 
 
 @wp.kernel

@@ -426,7 +426,7 @@ def search(
 def solve_vertex(
     map: ReflectorMapView,
     frame: SolveFrame,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     settings: SearchSettings,
     target: wp.vec3,
     warm_seed: wp.vec3,
@@ -464,7 +464,7 @@ def solve_vertex(
     out_vertex.status[i] = wp.uint8(status)
     out_vertex.reach[i] = edge_reach(frame, r.p, r.n, target, map.least_curvature)
     q = virtual_vertex(frame, r.p, r.n, target)
-    out_vertex.screen[i] = project(camera, q)
+    out_vertex.screen[i] = project(camera[0], q)
     if out_vertex.position.shape[0] > 0:
         out_vertex.position[i] = q
 

@@ -419,7 +419,7 @@ def search_blocks_kernel(
     # Reflector:
     map: ReflectorMapView,
     frame: SolveFrame,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     settings: SearchSettings,
     warm: int,
     # Outputs (seed: in and out, zero where none):
@@ -433,7 +433,7 @@ def search_blocks_kernel(
         own_count,
         map,
         frame,
-        camera,
+        camera[0],
         settings,
         warm,
         GAUGE_STEPS,

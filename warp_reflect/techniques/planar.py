@@ -53,7 +53,7 @@ def mirror_kernel(
     own_first: int,
     own_count: int,
     frame: SolveFrame,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     out_vertex: VertexView,
 ):
     """One thread per scene vertex: its mirror image, if it lies on the eye's side."""
@@ -66,7 +66,7 @@ def mirror_kernel(
         return
     out_vertex.status[i] = wp.uint8(CONVERGED)
     virtual = wp.vec3(q[0], q[1], -q[2])
-    out_vertex.screen[i] = project(camera, frame.eye_from_unit * (virtual - frame.eye))
+    out_vertex.screen[i] = project(camera[0], frame.eye_from_unit * (virtual - frame.eye))
 
 
 @wp.kernel

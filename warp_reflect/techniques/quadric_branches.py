@@ -168,7 +168,7 @@ def search_branches_kernel(
     # Reflector:
     view: BranchView,
     frame: SolveFrame,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     # Outputs:
     out_upright: VertexView,
     out_mirrored: VertexView,
@@ -188,13 +188,13 @@ def search_branches_kernel(
     # A point close to the mirror is seen beside its foot, where the lattice's cells are too coarse.
     near = polish(view, frame.eye, target, target)
     if near.valid != 0 and near.index == 0:
-        shown = project(camera, frame.eye_from_unit * (near.point - frame.eye))
+        shown = project(camera[0], frame.eye_from_unit * (near.point - frame.eye))
         bounds = view.bounds
         # Beside the lattice it would be the one corner of its triangles that is known.
         inside = shown[0] > bounds[0] and shown[0] < bounds[2] and shown[1] > bounds[1] and shown[1] < bounds[3]
         if inside and shown[2] > 0.0:
             shortest_0 = near.length
-            write_root(frame, camera, near, target, i, out_upright)
+            write_root(frame, camera[0], near, target, i, out_upright)
     above_x = _row()
     above_y = _row()
     y = int(0)
@@ -239,13 +239,13 @@ def search_branches_kernel(
                                 if root.valid != 0:
                                     if root.index == 0 and root.length < shortest_0:
                                         shortest_0 = root.length
-                                        write_root(frame, camera, root, target, i, out_upright)
+                                        write_root(frame, camera[0], root, target, i, out_upright)
                                     elif root.index == 1 and root.length < shortest_1:
                                         shortest_1 = root.length
-                                        write_root(frame, camera, root, target, i, out_mirrored)
+                                        write_root(frame, camera[0], root, target, i, out_mirrored)
                                     elif root.index == 2 and root.length < shortest_2:
                                         shortest_2 = root.length
-                                        write_root(frame, camera, root, target, i, out_turned)
+                                        write_root(frame, camera[0], root, target, i, out_turned)
             corner_x = over_x
             corner_y = over_y
             above_x[x] = gx
@@ -262,7 +262,7 @@ def follow_kernel(
     points: wp.array(dtype=wp.vec3),
     view: BranchView,
     frame: SolveFrame,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     pairs: wp.array(dtype=wp.vec2i),
     branch: int,
     out_vertex: VertexView,
@@ -273,7 +273,7 @@ def follow_kernel(
     target = frame.unit_from_scene * points[i] + frame.unit_offset
     root = polish(view, frame.eye, target, out_vertex.seed[pairs[k][1]])
     if root.valid != 0 and root.index == branch:
-        write_root(frame, camera, root, target, i, out_vertex)
+        write_root(frame, camera[0], root, target, i, out_vertex)
 
 
 @dataclass(frozen=True)
@@ -435,7 +435,7 @@ def reflect_branches(
             branches.append((mesh, vertices))
         layer.virtual = [Drawn(pixels, mesh, vertices.screen) for mesh, vertices in branches]
     with timer("virtual_raster"):
-        target = raster.make_target(gbuffer.view, pixels.box, scene.device, gbuffer.reflector_id, reflector.id)
+        target = raster.make_target(gbuffer.camera, pixels.box, scene.device, gbuffer.reflector_id, reflector.id)
         if settings.refine != "off":
             raster.attach_rays(target, gbuffer.view, pixels, settings.threads, settings.kernels)
         drawn = offset = 0

@@ -30,7 +30,7 @@ def search_kernel(
     # Reflector:
     quadric: QuadricView,
     frame: SolveFrame,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     warm: int,
     # Outputs (seed: in and out, zero where none):
     out_vertex: VertexView,

@@ -144,7 +144,7 @@ def search_convex(quadric: QuadricView, eye: wp.vec3, target: wp.vec3, seed: wp.
 def solve_vertex(
     quadric: QuadricView,
     frame: SolveFrame,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     target: wp.vec3,
     warm_seed: wp.vec3,
     i: int,
@@ -160,7 +160,7 @@ def solve_vertex(
         if facing:
             out_vertex.seed[i] = target
             image = frame.eye_from_unit * (target - frame.eye)
-            out_vertex.screen[i] = project(camera, image)
+            out_vertex.screen[i] = project(camera[0], image)
             if out_vertex.position.shape[0] > 0:
                 out_vertex.position[i] = image
         return
@@ -173,7 +173,7 @@ def solve_vertex(
             out_vertex.status[i] = wp.uint8(CONVERGED)
             beyond = wp.normalize(-frame.eye) * wp.length(target)
             image = frame.eye_from_unit * (beyond - frame.eye)
-            out_vertex.screen[i] = project(camera, image)
+            out_vertex.screen[i] = project(camera[0], image)
             if out_vertex.position.shape[0] > 0:
                 out_vertex.position[i] = image
             return
@@ -192,6 +192,6 @@ def solve_vertex(
     out_vertex.status[i] = wp.uint8(CONVERGED)
     out_vertex.reach[i] = edge_reach(frame, p, n, target, least_curvature(quadric, p, n, n_length))
     q = virtual_vertex(frame, p, n, target)
-    out_vertex.screen[i] = project(camera, q)
+    out_vertex.screen[i] = project(camera[0], q)
     if out_vertex.position.shape[0] > 0:
         out_vertex.position[i] = q

@@ -238,7 +238,7 @@ def search_blocks_kernel(
     # Reflector:
     quadric: QuadricView,
     frame: SolveFrame,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     warm: int,
     # Outputs (seed: in and out, zero where none; per block, whether something is left for the plain kernel):
     out_vertex: VertexView,
@@ -252,7 +252,7 @@ def search_blocks_kernel(
         own_count,
         quadric,
         frame,
-        camera,
+        camera[0],
         warm,
         TOUCHING,
         GUESS_STEPS,

@@ -57,7 +57,7 @@ def search_kernel(
     # Reflector:
     map: ReflectorMapView,
     frame: SolveFrame,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     settings: SearchSettings,
     warm: int,
     # Outputs (seed: in and out, zero where none):

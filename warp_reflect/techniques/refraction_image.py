@@ -67,7 +67,7 @@ class Under:
 def refract_vertices_kernel(
     first: int,
     points: wp.array(dtype=wp.vec3),
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     on_plane: wp.vec3,
     normal: wp.vec3,
     height: float,
@@ -76,7 +76,7 @@ def refract_vertices_kernel(
 ):
     """One thread per point under a plane: where the eye, `height` above it, sees the point."""
     i = first + wp.tid()
-    p = points[i] - camera.eye
+    p = points[i] - camera[0].eye
     depth = wp.max(-wp.dot(points[i] - on_plane, normal), 0.0)
     across = p - wp.dot(p, normal) * normal
     way = wp.length(across)
@@ -107,7 +107,7 @@ def refract_vertices_kernel(
         crossing += (s / way) * across
     length = wp.length(crossing)
     behind = wp.length(p - crossing)
-    out_screen[i] = project(camera, crossing * ((length + behind) / wp.max(length, 1.0e-30)))
+    out_screen[i] = project(camera[0], crossing * ((length + behind) / wp.max(length, 1.0e-30)))
 
 
 def applies(scene: Scene, part: int, pixels: int) -> tuple[bool, str, dict]:
@@ -255,7 +255,7 @@ def follow(
 
     screen = seen_at(found.solved)
     mesh, screen = _cut_where_bent(scene, found, screen, seen_at, layer.pixels.box, settings)
-    target = raster.make_target(gbuffer.view, layer.pixels.box, device)
+    target = raster.make_target(gbuffer.camera, layer.pixels.box, device)
     raster.attach_rays(target, gbuffer.view, layer.pixels, threads, settings.kernels)
     drawn = raster.rasterise(
         target, screen, mesh.triangles, points=mesh.points, threads=threads, kernels=settings.kernels

@@ -83,7 +83,7 @@ def refract_block(
 def refract_blocks_kernel(
     first: int,
     points: wp.array(dtype=wp.vec3),
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     on_plane: wp.vec3,
     normal: wp.vec3,
     height: float,
@@ -93,4 +93,4 @@ def refract_blocks_kernel(
     out_screen: wp.array(dtype=wp.vec4),
 ):
     """One thread per block of points under a plane; perspective cameras."""
-    refract_block(first + wp.tid(), points, camera, on_plane, normal, height, ior, steps, digits, out_screen)
+    refract_block(first + wp.tid(), points, camera[0], on_plane, normal, height, ior, steps, digits, out_screen)

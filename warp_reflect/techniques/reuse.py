@@ -59,7 +59,7 @@ def drift_rate(to_virtual: wp.vec3, to_target: wp.vec3, curvature: float) -> flo
 def keep_kernel(
     first: int,
     points: wp.array(dtype=wp.vec3),
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     eye_before: wp.vec3,
     curvature: float,
     limit: float,
@@ -73,11 +73,11 @@ def keep_kernel(
     position = before.position[i]
     if wp.length_sq(position) == 0.0:
         return
-    move = camera.eye - eye_before
+    move = camera[0].eye - eye_before
     rate = drift_rate(position, points[i] - eye_before, curvature)
     moved = position - move
     # Radians off the axis are more pixels than on it.
-    depth = wp.dot(camera.forward, moved)
+    depth = wp.dot(camera[0].forward, moved)
     if depth <= 0.0:
         return
     oblique = wp.length_sq(moved) / (depth * depth)
@@ -89,14 +89,14 @@ def keep_kernel(
     out_vertex.drift[i] = drift
     out_vertex.reach[i] = before.reach[i]
     out_vertex.residual[i] = before.residual[i]
-    out_vertex.screen[i] = project(camera, moved)
+    out_vertex.screen[i] = project(camera[0], moved)
 
 
 def keep(
     scene: Scene,
     points: wp.array,
     camera: Camera,
-    view: CameraView,
+    view: wp.array,
     history,
     curvature: float,
     settings: Settings,

@@ -156,7 +156,7 @@ def search_sheet_kernel(
     side: float,
     lattice: PixelLattice,
     frame: SolveFrame,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     # Outputs:
     out_upright: VertexView,
     out_mirrored: VertexView,
@@ -222,13 +222,13 @@ def search_sheet_kernel(
                                 if found.root.valid != 0:
                                     if found.root.index == 0 and found.root.length < shortest_0:
                                         shortest_0 = found.root.length
-                                        write(frame, camera, found, target, i, out_upright)
+                                        write(frame, camera[0], found, target, i, out_upright)
                                     elif found.root.index == 1 and found.root.length < shortest_1:
                                         shortest_1 = found.root.length
-                                        write(frame, camera, found, target, i, out_mirrored)
+                                        write(frame, camera[0], found, target, i, out_mirrored)
                                     elif found.root.index == 2 and found.root.length < shortest_2:
                                         shortest_2 = found.root.length
-                                        write(frame, camera, found, target, i, out_turned)
+                                        write(frame, camera[0], found, target, i, out_turned)
             corner_x = over_x
             corner_y = over_y
             above_x[x] = gx
@@ -246,7 +246,7 @@ def follow_sheet_kernel(
     map: ReflectorMapView,
     side: float,
     frame: SolveFrame,
-    camera: CameraView,
+    camera: wp.array(dtype=CameraView),
     pairs: wp.array(dtype=wp.vec2i),
     branch: int,
     out_vertex: VertexView,
@@ -257,7 +257,7 @@ def follow_sheet_kernel(
     target = frame.unit_from_scene * points[i] + frame.unit_offset
     found = polish(map, side, frame.eye, target, out_vertex.seed[pairs[k][1]])
     if found.root.valid != 0 and found.root.index == branch:
-        write(frame, camera, found, target, i, out_vertex)
+        write(frame, camera[0], found, target, i, out_vertex)
 
 
 @dataclass(frozen=True)
