@@ -23,7 +23,6 @@ LEFT, MISSED = 1, 2  # flags of a block: rays are left to the plain kernels, som
 UNASKED = -2  # a triangle: nothing is known of what the ray meets
 # Pixels of a packet's part of the picture: as many as share most of a walk down the tree; a nearly square part meets few boxes.
 TILE_WIDTH, TILE_HEIGHT = 8, 4
-STRIP = 64  # pixels along a task's row of tiles
 # Cosine to the normal of a convex body below which a ray may still meet it: a normal between corners is not that of the facet.
 GRAZING = 1.0 / 16.0
 JOINED = 16  # rays; tiles with fewer are joined with the next ones, as most of a walk costs the same for any number
@@ -32,7 +31,7 @@ JOINED = 16  # rays; tiles with fewer are joined with the next ones, as most of 
 _CONSTANTS = f"""
     constexpr int NONE = {int(Status.NONE)}, CONVERGED = {int(Status.CONVERGED)}, SKY = {int(Status.SKY)};
     constexpr int LEFT = {LEFT}, MISSED = {MISSED}, UNASKED = {UNASKED};
-    constexpr int TILE_WIDTH = {TILE_WIDTH}, TILE_HEIGHT = {TILE_HEIGHT}, STRIP = {STRIP}, JOINED = {JOINED};
+    constexpr int TILE_WIDTH = {TILE_WIDTH}, TILE_HEIGHT = {TILE_HEIGHT}, JOINED = {JOINED};
     constexpr float GRAZING = {GRAZING}f;
 """
 
@@ -58,8 +57,7 @@ _CONSTANTS = f"""
     int row_start[TILE_HEIGHT];
     int at[TILE_HEIGHT], stop[TILE_HEIGHT], next_place = block * BLOCK;
     const int last_place = next_place + BLOCK < count ? next_place + BLOCK : count;
-    const int strips = width > 0 ? (width + STRIP - 1) / STRIP : 1;
-    const int top = TILE_HEIGHT * (first_band + block / strips), first_x = STRIP * (block % strips);
+    const int top = TILE_HEIGHT * (first_band + block);
     if (width > 0) {
         auto place_of = [&](int number, int low, int high) -> int {
             while (low < high) {
@@ -69,12 +67,10 @@ _CONSTANTS = f"""
             }
             return low;
         };
-        const int right = first_x + STRIP < width ? first_x + STRIP : width;
-        int low = place_of(top * width + first_x, 0, count);
-        const int high = place_of((top + TILE_HEIGHT - 1) * width + right, low, count);
+        int low = place_of(top * width, 0, count);
         for (int row = 0; row < TILE_HEIGHT; ++row) {
-            at[row] = low = place_of((top + row) * width + first_x, low, high);
-            stop[row] = low = place_of((top + row) * width + right, low, high);
+            at[row] = low;
+            stop[row] = low = place_of((top + row + 1) * width, low, low + width < count ? low + width : count);
         }
     }
     auto take = [&]() {
@@ -91,7 +87,7 @@ _CONSTANTS = f"""
                 x = own < x ? own : x;
             }
             if (x == width) return;
-            x -= (x - first_x) % TILE_WIDTH;
+            x -= x % TILE_WIDTH;
             int middle[TILE_HEIGHT], end[TILE_HEIGHT], full_rows = 0;
             for (int row = 0; row < TILE_HEIGHT; ++row) {
                 const int own = (top + row) * width + x;
@@ -115,17 +111,20 @@ _CONSTANTS = f"""
                     // The rays beside it and their answers' places are fetched while these are on their way.
                     if (end[row] == stop[row]) continue;
                     const int next = end[row];
-                    for (int line = 0; line < 32; line += 16) {
-                        __builtin_prefetch(points + 3 * next + line);
-                        __builtin_prefetch(normals + 3 * next + line);
-                        __builtin_prefetch(directions + 3 * next + line);
+                    // A row of a tile lies on two cache lines or three.
+                    for (int word = 0; word < 3 * TILE_WIDTH; word += word ? 3 * TILE_WIDTH - 17 : 16) {
+                        __builtin_prefetch(points + 3 * next + word);
+                        __builtin_prefetch(normals + 3 * next + word);
+                        __builtin_prefetch(directions + 3 * next + word);
                     }
                     __builtin_prefetch(facets.data + (pixel.shape[0] > 0 ? pixel.data[next] : next));
-                    __builtin_prefetch(out_triangle.data + next, 1);
-                    __builtin_prefetch(out_u.data + next, 1);
-                    __builtin_prefetch(out_v.data + next, 1);
-                    __builtin_prefetch(out_t.data + next, 1);
                     __builtin_prefetch(out_status.data + next, 1);
+                    for (int last = next; last < next + TILE_WIDTH; last += TILE_WIDTH - 1) {
+                        __builtin_prefetch(out_triangle.data + last, 1);
+                        __builtin_prefetch(out_u.data + last, 1);
+                        __builtin_prefetch(out_v.data + last, 1);
+                        __builtin_prefetch(out_t.data + last, 1);
+                    }
                 }
                 taken = RAYS;
                 return;
@@ -148,11 +147,27 @@ _CONSTANTS = f"""
         return first + (lanes() & 3);
     };
     auto rows = [&](const float* p, I own) -> V {
-#if defined(__AVX512F__)
-        return vgather(p, own);
-#else
         if (!full) return vgather(p, own);
         auto four = [&](int k) -> Four { Four v; __builtin_memcpy(&v, p + k, sizeof(v)); return v; };
+#if defined(__AVX512F__)
+        // Of each of its blocks of 128 bits: x y z x, y z x y, z x y z.
+        Four part[3][4];
+        _Pragma("clang loop unroll(full)") for (int row = 0; row < 4; ++row) {
+            const int own_row = 3 * own[4 * row];
+            _Pragma("clang loop unroll(full)") for (int k = 0; k < 3; ++k) part[k][row] = four(own_row + 4 * k);
+        }
+        const F a = joined(part[0]), b = joined(part[1]), c = joined(part[2]);
+        return V{
+            __builtin_shufflevector(__builtin_shufflevector(a, b,
+                0, 3, 18, -1, 4, 7, 22, -1, 8, 11, 26, -1, 12, 15, 30, -1), c,
+                0, 1, 2, 17, 4, 5, 6, 21, 8, 9, 10, 25, 12, 13, 14, 29),
+            __builtin_shufflevector(__builtin_shufflevector(a, b,
+                1, 16, 19, -1, 5, 20, 23, -1, 9, 24, 27, -1, 13, 28, 31, -1), c,
+                0, 1, 2, 18, 4, 5, 6, 22, 8, 9, 10, 26, 12, 13, 14, 30),
+            __builtin_shufflevector(__builtin_shufflevector(a, b,
+                2, 17, -1, -1, 6, 21, -1, -1, 10, 25, -1, -1, 14, 29, -1, -1), c,
+                0, 1, 16, 19, 4, 5, 20, 23, 8, 9, 24, 27, 12, 13, 28, 31)};
+#else
         const int one = 3 * own[0], other = 3 * own[4];
         float both[24];
         const F a = __builtin_shufflevector(four(one), four(one + 4), 0, 1, 2, 3, 4, 5, 6, 7);
@@ -365,7 +380,7 @@ def first_met_blocks_kernel(
     out_status: wp.array(dtype=wp.uint8),
     out_state: wp.array(dtype=int),
 ):
-    """One thread per block of asked rays; width > 0: per `STRIP` of a row of tiles of the picture."""
+    """One thread per block of asked rays; width > 0: per row of tiles of the picture."""
     block = first + wp.tid()
     first_met_block(
         block,
@@ -431,11 +446,12 @@ def first_met(
     """
     device = rays[0].device
     blocks, first_band = vector.block_count(len(rays[0]) if index is None else len(index)), 0
+    split = blocks >= BLOCK_SPLIT_MIN
     if width > 0:
         own = numbers.numpy() if index is None else numbers.numpy()[index.numpy()]
         if own[0] >= 0 and (own[1:] > own[:-1]).all():
             first_band = int(own[0]) // (TILE_HEIGHT * width)
-            blocks = (int(own[-1]) // (TILE_HEIGHT * width) + 1 - first_band) * -(-width // STRIP)
+            blocks = int(own[-1]) // (TILE_HEIGHT * width) + 1 - first_band
         else:
             width = 0
     which = [compact.none(int, device) if index is None else index, int(index is not None)]
@@ -453,5 +469,5 @@ def first_met(
         *outputs,
         state,
     ]
-    launch(first_met_blocks_kernel, blocks, inputs, device, threads, split_min=BLOCK_SPLIT_MIN)
+    launch(first_met_blocks_kernel, blocks, inputs, device, threads, split_min=1 if split else blocks + 1)
     return int(np.bitwise_or.reduce(state.numpy()))
