@@ -8,7 +8,9 @@ import pytest
 from rooms import placed, sphere, square
 
 import warp_reflect as wr
-from warp_reflect import launch
+from warp_reflect import frame as frame_module
+from warp_reflect import launch, shade
+from warp_reflect.layers import undivided
 from warp_reflect.scene import CameraData, InstanceData, MaterialData, Scene, SceneData
 
 SIZE = (120, 68)
@@ -182,6 +184,40 @@ def test_nothing_of_it_runs_where_no_mirror_sees_one(device):
         frame = rendered(world(BALLS))
     assert frame.plan.rows[0].effects["second_bounce"].on
     assert [name for name in launches if "reflect_hits" in str(name)]
+
+
+# Two balls side by side among the ids, and a wall that a plane's technique takes from between mirrors or from their end.
+MIXED = [WALLS[0], *BALLS, ("ball", (0.1, 0.8, -1.9), 0.3, silver(0.7))]
+
+
+@pytest.mark.parametrize("method", ["reference", "planar", "quadric"])
+@pytest.mark.parametrize("turned", [False, True])
+def test_mirrors_done_together_are_those_done_one_by_one(method, turned, monkeypatch):
+    scene = world(MIXED[::-1] if turned else MIXED)
+    settings = {"bounces": 3, "shadows": "on"}
+    together = [rendered(scene, method=method, threads=threads, **settings) for threads in (1, 2, 8)]
+    wholes = {id(layer.whole) for layer in together[0].layers.values() if layer.whole is not None}
+    assert len(together[0].layers) == 4 and len(wholes) == (method != "quadric")
+    monkeypatch.setattr(frame_module, "_together", lambda rows, pixels: [[row] for row in rows])
+    alone = rendered(scene, method=method, threads=1, **settings)
+    assert all(layer.whole is None for layer in alone.layers.values())
+    for frame in together:
+        for name in ("RGBA", "reflection", "reflectedPoint", "pathLength", "status", "reflectedId"):
+            np.testing.assert_array_equal(frame[name], alone[name], err_msg=name)
+        for id_, layer in frame.layers.items():
+            assert dict(layer.statistics) == dict(alone.layers[id_].statistics)
+    assert together[0].statistics["bounced"] > 100
+
+
+def test_mirrors_that_were_done_together_are_shaded_by_themselves_where_one_is_missing():
+    scene = world(MIXED)
+    frame = rendered(scene, method="reference")
+    others = dict(frame.layers)
+    others[1] = dataclasses.replace(others[1], whole=None)  # as it is where it was answered in another frame
+    assert len(undivided(frame.layers.values())) == 1 and len(undivided(others.values())) == 4
+    pictures = [shade.shade(scene, frame.gbuffer, layers) for layers in (frame.layers, others)]
+    for whole, parts in zip(*pictures, strict=True):
+        np.testing.assert_array_equal(whole.numpy(), parts.numpy())
 
 
 def test_threads_do_not_change_a_pixel():

@@ -56,12 +56,14 @@ def test_pixels_sorted_by_id_are_those_found_one_by_one(kind, wanted, device):
         ids.reshape(-1)[width - 2 : width + 3] = wanted[0]  # the end of a row and the beginning of the next
         ids.reshape(-1)[-1] = wanted[-1]
     flat = ids.reshape(-1)
-    expected = surface._pixels_by_id(flat, wanted)
-    found = surface._sorted_by_id(wp.array(flat, dtype=int, device=device), wanted, width)
-    assert found.keys() == expected.keys() == set(wanted)
-    for id, (pixel, box) in found.items():
-        np.testing.assert_array_equal(pixel.numpy(), expected[id])
-        assert box == pixel_bounds(expected[id], width)
+    expected, ends = surface._pixels_by_id(flat, wanted)
+    found, runs = surface._sorted_by_id(wp.array(flat, dtype=int, device=device), wanted, width)
+    np.testing.assert_array_equal(found.numpy(), expected)
+    assert runs.keys() == ends.keys() == set(wanted)
+    for id, (first, end, box) in runs.items():
+        np.testing.assert_array_equal(expected[first:end], np.flatnonzero(flat == id))
+        assert (first, end) == ends[id] or (first == end and ends[id][0] == ends[id][1])
+        assert box == pixel_bounds(expected[first:end], width)
 
 
 def test_what_is_not_black_is_listed_and_everything_counted(device):

@@ -145,11 +145,11 @@ def test_pixels_of_each_id_are_listed(count, kind, wanted):
     expected = np.where(triangle >= 0, patch_id[triangle], 0)
     given = [wp.array(each, dtype=int, device=CPU) for each in (triangle, np.arange(len(patch_id)), patch_id)]
     for threads in (1, 2):
-        ids, pixels = surface_vector.pixels_by_id(*given, max(wanted), threads)
+        ids, pixel, edges = surface_vector.pixels_by_id(*given, max(wanted), threads)
         np.testing.assert_array_equal(ids.numpy(), expected)
-        assert len(pixels) == max(wanted)
-        for id, pixel in enumerate(pixels, 1):
-            np.testing.assert_array_equal(pixel.numpy(), np.flatnonzero(expected == id))
+        assert len(edges) == max(wanted) + 1 and edges[0] == 0 and edges[-1] == len(pixel)
+        for id, (first, end) in enumerate(itertools.pairwise(edges), 1):
+            np.testing.assert_array_equal(pixel.numpy()[first:end], np.flatnonzero(expected == id))
 
 
 def test_bands_of_rows_have_whole_tiles():

@@ -221,7 +221,6 @@ def onward(
         going = compact.positive(carried)
         if not len(going):
             return total
-        add_statistics(first.statistics, {"bounced": len(going)})
         if total is seen:
             total = wp.clone(seen)
         known = [going, asked, point, normal, direction, carried, domes, layer.triangle, layer.pixels.pixel, index]
@@ -229,6 +228,7 @@ def onward(
         facet, pixel, index = (wp.empty(len(going), dtype=int, device=device) for _ in range(3))
         taken = [point, normal, direction, weight, domes, facet, pixel, index]
         launch.launch(take_rays_kernel, len(going), [*known, *taken], device, threads)
+        first.count_later("bounced", index.numpy)
         pixels = MirrorPixels(layer.pixels.reflector, pixel, point, normal, direction, layer.pixels.box)
         make = ReflectionLayer.unset if forward is None or depth else ReflectionLayer.empty
         layer = make(pixels, Technique.RAYTRACED, device)
@@ -239,7 +239,7 @@ def onward(
         else:
             bvh.trace_bounced(scene, layer, facet, mirrors.bodies, threads, kernels, width)
         launch.launch(add_bounce_kernel, len(going), [index, weight, domes, met(layer), total], device, threads)
-    first.statistics.later(partial(_ended, scene, gbuffer, mirrors, layer, weight, threads))
+    first.count_later("bounce_limit", partial(_ended, scene, gbuffer, mirrors, layer, weight, index, threads))
     return total
 
 
@@ -259,15 +259,20 @@ def _reflections(
 
 
 def _ended(
-    scene: Scene, gbuffer: GBuffer, mirrors: Mirrors, layer: ReflectionLayer, weight: wp.array, threads: int
-) -> dict[str, int]:
-    """Statistics of the last rays that are followed: how many meet a mirror again."""
+    scene: Scene,
+    gbuffer: GBuffer,
+    mirrors: Mirrors,
+    layer: ReflectionLayer,
+    weight: wp.array,
+    index: wp.array,
+    threads: int,
+) -> np.ndarray:
+    """Of the last rays that are followed those that meet a mirror again, as numbers of the first layer's."""
     asked = meeting(scene, layer, mirrors.patches)
     if not len(asked):
-        return {}
+        return asked.numpy()
     *_, carried, _ = _reflections(scene, gbuffer, layer, asked, weight, threads)
-    count = len(compact.positive(carried))
-    return {"bounce_limit": count} if count else {}
+    return compact.taken(index, compact.taken(asked, compact.positive(carried))).numpy()
 
 
 def _trace_others(

@@ -165,6 +165,11 @@ def taken(array: wp.array, numbers: wp.array) -> wp.array:
     return wp.indexedarray(array, [numbers]).contiguous()
 
 
+def run(array: wp.array, first: int, end: int) -> wp.array:
+    """A slice of an array; one without elements too, which Warp refuses to make."""
+    return array[first:end] if end > first else none(array.dtype, array.device)
+
+
 def joined(arrays: Sequence[wp.array]) -> wp.array:
     """Arrays of one kind, one after the other; a single one is itself."""
     if len(arrays) == 1:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
@@ -318,27 +318,45 @@ def reflect_scene(
     else:
         gbuffer, pixels = _look(scene, plan, view, timer)
         answered = {}
-    layers = {}
     seen = [row for row in plan.rows if row.reflector.id in pixels and pixels[row.reflector.id].count > 0]
+    asked = [row for row in seen if row.reflector.id not in answered]
     with timer("prepare"):
-        plan.prepare_together(row for row in seen if row.reflector.id not in answered)
-    for row in seen:
-        if row.reflector.id in answered:
-            layers[row.reflector.id] = answered[row.reflector.id]
-            continue
+        plan.prepare_together(asked)
+    for rows in _together(asked, pixels):
         with timer("prepare"):
-            prepared = plan.prepared(row)
+            prepared = [plan.prepared(row) for row in rows]
         with timer("reflect"):
-            layers[row.reflector.id] = TECHNIQUES[row.technique].reflect(
-                scene,
-                prepared,
-                gbuffer,
-                pixels[row.reflector.id],
-                view,
-                row.settings,
-                _history(previous, scene, row),
-            )
-    return gbuffer, layers
+            shown = [pixels[row.reflector.id] for row in rows]
+            if len(rows) > 1:
+                found = TECHNIQUES[rows[0].technique].reflect_together(
+                    scene, prepared, gbuffer, shown, rows[0].settings
+                )
+            else:
+                reflect, history = TECHNIQUES[rows[0].technique].reflect, _history(previous, scene, rows[0])
+                found = [reflect(scene, prepared[0], gbuffer, shown[0], view, rows[0].settings, history)]
+        answered.update((layer.pixels.reflector, layer) for layer in found)
+    return gbuffer, {row.reflector.id: answered[row.reflector.id] for row in seen}
+
+
+def _together(rows: Iterable[PlanRow], pixels: Mapping[int, MirrorPixels]) -> list[list[PlanRow]]:
+    """The rows in groups whose rays are treated alike and whose pixels follow one another."""
+    groups: list[list[PlanRow]] = []
+    for row in rows:
+        last = groups[-1][-1] if groups else None
+        own, before = (pixels[each.reflector.id] for each in (row, last or row))
+        if last is not None and own.follows(before) and _treatment(row) == _treatment(last):
+            groups[-1].append(row)
+        else:
+            groups.append([row])
+    return groups
+
+
+def _treatment(row: PlanRow) -> tuple:
+    """What becomes of a mirror's rays: of no other's the same, unless they are traced and shaded as they are."""
+    bounce = row.effects["second_bounce"]
+    plain = row.technique == "raytraced" and not bounce.numbers.get("solved")
+    plain = plain and not any(row.effects[name].on for name in FINISHES)
+    return 0 if plain else row.reflector.id, bounce.on, row.settings.threads, row.settings.kernels
 
 
 def _interfaces(scene: Scene, plan: Plan) -> transmission.Interfaces | None:

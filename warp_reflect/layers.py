@@ -6,7 +6,10 @@ The *eye frame* has world axes and its origin at the eye.
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import cache, partial
 
 import numpy as np
 import warp as wp
@@ -194,6 +197,7 @@ class GBuffer:
     reflector_id: wp.array | None = None
 
 
+Box = tuple[int, int, int, int]  # x0, y0, x1, y1, half-open [pixels]
 NO_REFLECTOR = 0  # id of rays that no mirror has reflected
 
 
@@ -208,6 +212,7 @@ class MirrorPixels:
         normal: vec3 [n], unit, on the eye's side.
         direction: vec3 [n], unit reflected direction.
         box: (x0, y0, x1, y1), half-open bounds of the pixels.
+        whole: Those of several reflectors, one after the other, whose slice from `first` on these are; None: they are alone.
     """
 
     reflector: int
@@ -215,11 +220,33 @@ class MirrorPixels:
     point: wp.array
     normal: wp.array
     direction: wp.array
-    box: tuple[int, int, int, int]
+    box: Box
+    whole: MirrorPixels | None = None
+    first: int = 0
 
     @property
     def count(self) -> int:
         return len(self.pixel)
+
+    def part(self, reflector: int, first: int, end: int, box: Box) -> MirrorPixels:
+        """One reflector's of a whole's."""
+        if end - first == self.count:
+            return replace(self, reflector=reflector, box=box)
+        arrays = (compact.run(array, first, end) for array in (self.pixel, self.point, self.normal, self.direction))
+        return MirrorPixels(reflector, *arrays, box, self, first)
+
+    def follows(self, other: MirrorPixels) -> bool:
+        """Whether they lie right behind another reflector's."""
+        return self.whole is not None and self.whole is other.whole and self.first == other.first + other.count
+
+    @staticmethod
+    def joined(pixels: Sequence[MirrorPixels]) -> MirrorPixels:
+        """Those of several reflectors, each of which follows the one before, as if they were the first one's."""
+        if len(pixels) == 1:
+            return pixels[0]
+        left, top, right, bottom = zip(*(each.box for each in pixels), strict=True)
+        box = min(left), min(top), max(right), max(bottom)
+        return pixels[0].whole.part(pixels[0].reflector, pixels[0].first, pixels[-1].first + pixels[-1].count, box)
 
     def select(self, chosen: wp.array, reflector: int, width: int) -> MirrorPixels:
         """Some of the pixels under another id.
@@ -234,7 +261,7 @@ class MirrorPixels:
         return MirrorPixels(reflector, pixel, *vectors, pixel_bounds(pixel.numpy(), width))
 
 
-def pixel_bounds(pixel: np.ndarray, width: int) -> tuple[int, int, int, int]:
+def pixel_bounds(pixel: np.ndarray, width: int) -> Box:
     """Half-open bounds (x0, y0, x1, y1) of ascending pixel numbers; all 0 if there are none."""
     if not len(pixel):
         return (0, 0, 0, 0)
@@ -281,6 +308,9 @@ class ReflectionLayer:
         cells: What an interpolation grid ended with: `grid.UsedCells` of every piece that has one.
         radiance: vec3 [n], what is seen at each pixel where the technique knows it itself (environment maps); None: it is
             shaded at the hits.
+        whole: The layer of several reflectors that all are answered and shaded together, whose slice this one is; None: it is
+            alone.
+        shares: Of a whole: each reflector's first ray, the end of its rays, and its statistics.
     """
 
     pixels: MirrorPixels
@@ -296,6 +326,8 @@ class ReflectionLayer:
     virtual: list = field(default_factory=list)
     cells: list = field(default_factory=list)
     radiance: wp.array | None = None
+    whole: ReflectionLayer | None = None
+    shares: list[tuple[int, int, Statistics]] = field(default_factory=list)
 
     @classmethod
     def unset(cls, pixels: MirrorPixels, method: int, device) -> ReflectionLayer:
@@ -317,6 +349,46 @@ class ReflectionLayer:
             distance=wp.zeros(n, dtype=float, device=device),
             status=wp.full(n, int(Status.NONE), dtype=wp.uint8, device=device),
         )
+
+    def parts(self, pixels: Sequence[MirrorPixels]) -> list[ReflectionLayer]:
+        """The layers of the reflectors whose joined pixels these are, as slices."""
+        if len(pixels) == 1:
+            return [self]
+        made, end = [], 0
+        for each in pixels:
+            first, end = end, end + each.count
+            arrays = (array[first:end] for array in (self.triangle, self.u, self.v, self.distance, self.status))
+            made.append(ReflectionLayer(each, self.method, *arrays, whole=self))
+            self.shares.append((first, end, made[-1].statistics))
+        return made
+
+    def count_later(self, name: str, rays: Callable[[], np.ndarray]) -> None:
+        """Add to each reflector's statistics how many rays are its own, when they are asked for; nothing where none is.
+
+        Args:
+            name: Of the statistics.
+            rays: Gives their numbers among the layer's.
+        """
+        numbers = cache(rays)
+        for first, end, statistics in self.shares or [(0, self.pixels.count, self.statistics)]:
+            statistics.later(partial(_counted, name, numbers, first, end))
+
+
+def _counted(name: str, numbers: Callable[[], np.ndarray], first: int, end: int) -> dict[str, int]:
+    count = int(np.count_nonzero((numbers() >= first) & (numbers() < end)))
+    return {name: count} if count else {}
+
+
+def undivided(layers: Iterable[ReflectionLayer]) -> list[ReflectionLayer]:
+    """Layers, and instead of those that are slices of a whole that whole, where all of its slices are among them."""
+    layers = list(layers)
+    slices = Counter(id(layer.whole) for layer in layers)
+    found = {}
+    for layer in layers:
+        whole = layer.whole
+        each = layer if whole is None or slices[id(whole)] < len(whole.shares) else whole
+        found[id(each)] = each
+    return list(found.values())
 
 
 @wp.kernel(module=MET)

@@ -28,7 +28,14 @@ import warp as wp
 
 from warp_reflect import compact, launch, vector
 from warp_reflect.direct import AREA_KINDS, AreaView, DirectView, direct_irradiance, points_of, prepare_direct
-from warp_reflect.layers import CameraView, GBuffer, ReflectionLayer, eye_ray_direction, eye_ray_origin
+from warp_reflect.layers import (
+    CameraView,
+    GBuffer,
+    ReflectionLayer,
+    eye_ray_direction,
+    eye_ray_origin,
+    undivided,
+)
 from warp_reflect.normal_maps import prepare_normals
 from warp_reflect.scene import SHAPE_QUADRIC, Scene, SceneView
 from warp_reflect.shadows import Shadows, shadowed_irradiance, sky_share
@@ -639,7 +646,7 @@ def shade(
         inputs = [scene.view, gbuffer.view, lights, looks, normals, direct, sky, gbuffer.triangle]
         inputs += [gbuffer.reflector_id, picture, mirror]
         launch.launch(shade_kernel, count, inputs, device, threads)
-    for layer in layers.values():
+    for layer in undivided(layers.values()):
         radiance = shown.seen(layer)
         if finish is not None:
             radiance = finish(shown, layer, radiance)

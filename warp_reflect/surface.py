@@ -7,6 +7,7 @@ normal, or for a gprim the analytic surface behind the facet, met by the eye ray
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
+from itertools import pairwise
 
 import numpy as np
 import warp as wp
@@ -14,6 +15,7 @@ import warp as wp
 from warp_reflect import compact, launch, vector
 from warp_reflect.layers import (
     NO_REFLECTOR,
+    Box,
     CameraView,
     GBuffer,
     MirrorPixels,
@@ -29,7 +31,7 @@ PLAIN = launch.module_part(__name__, "plain")  # what vector kernels do elsewher
 CHANNELS = launch.module_part(__name__, "channels")
 SORTED = launch.module_part(__name__, "sorted")
 
-Box = tuple[int, int, int, int]  # x0, y0, x1, y1, half-open [pixels]
+Run = tuple[int, int, Box]  # of an id's pixels: the first, the end, their bounds
 
 # An interpolated normal shorter than this has lost its direction (corners apart); the facet's is used.
 LEAST_NORMAL = wp.constant(0.1)
@@ -312,29 +314,38 @@ def mirror_pixels(
     width, height = gbuffer.camera.size
     if not parts:
         return {}, wp.zeros(width * height, dtype=int, device=scene.device)
-    found, reflector_id = _pixels_of(scene, gbuffer, parts, threads, kernels, "reflectors")
-    return {id: _met(scene, gbuffer, id, *found[id], threads, kernels) for id in parts}, reflector_id
+    pixel, runs, reflector_id = _pixels_of(scene, gbuffer, parts, threads, kernels, "reflectors")
+    whole = _met(scene, gbuffer, pixel, threads, kernels)
+    return {id: whole.part(id, *runs[id]) for id in parts}, reflector_id
 
 
 def _pixels_of(
     scene: Scene, gbuffer: GBuffer, parts: Mapping[int, int], threads: int, kernels: str, who: str = "others"
-) -> tuple[dict[int, tuple[wp.array, Box]], wp.array]:
-    """(by id: the ascending pixels that show a part, and their bounds; id per pixel, 0 where there is none of the parts)."""
+) -> tuple[wp.array, dict[int, Run], wp.array]:
+    """Which pixels show some parts.
+
+    Returns:
+        (these pixels, part after part, ascending in each; where among them those of each id are; id per pixel, 0 where there
+        is none of the parts).
+    """
     width, height = gbuffer.camera.size
     inputs = [gbuffer.triangle, scene.view.triangle_patch, _id_of_patch(scene, parts, who)]
     if vector.chosen(kernels, scene.device) and not launch.stays(scene.device):
         from warp_reflect import surface_vector  # which reflects at this module's surface
 
         if max(parts) <= surface_vector.LISTED_IDS:
-            ids, pixels = surface_vector.pixels_by_id(*inputs, max(parts), threads)
-            return {id: (pixels[id - 1], pixel_bounds(pixels[id - 1].numpy(), width)) for id in parts}, ids
+            ids, pixel, edges = surface_vector.pixels_by_id(*inputs, max(parts), threads)
+            return pixel, _runs(pixel.numpy(), {id: (edges[id - 1], edges[id]) for id in parts}, width), ids
     ids = wp.empty(width * height, dtype=int, device=scene.device)
     launch.launch(reflector_id_kernel, width * height, [*inputs, ids], scene.device, threads)
     if launch.stays(scene.device):
-        return _sorted_by_id(ids, parts, width), ids
-    found = _pixels_by_id(ids.numpy(), parts)
-    numbers = {id: compact.listed(pixel, scene.device) for id, pixel in found.items()}
-    return {id: (numbers[id], pixel_bounds(pixel, width)) for id, pixel in found.items()}, ids
+        return *_sorted_by_id(ids, parts, width), ids
+    pixel, ends = _pixels_by_id(ids.numpy(), parts)
+    return compact.listed(pixel, scene.device), _runs(pixel, ends, width), ids
+
+
+def _runs(pixel: np.ndarray, ends: Mapping[int, tuple[int, int]], width: int) -> dict[int, Run]:
+    return {id: (first, end, pixel_bounds(pixel[first:end], width)) for id, (first, end) in ends.items()}
 
 
 def _id_of_patch(scene: Scene, parts: Mapping[int, int], who: str) -> wp.array:
@@ -349,22 +360,13 @@ def _id_of_patch(scene: Scene, parts: Mapping[int, int], who: str) -> wp.array:
     return scene.kept(f"ids of {who}", dict(parts), make)
 
 
-def _met(
-    scene: Scene, gbuffer: GBuffer, reflector: int, pixel: wp.array, box: Box, threads: int, kernels: str
-) -> MirrorPixels:
-    """The surface at some pixels of the picture."""
+def _met(scene: Scene, gbuffer: GBuffer, pixel: wp.array, threads: int, kernels: str) -> MirrorPixels:
+    """The surface at some pixels of the picture, whichever mirror they show."""
     n, device = len(pixel), scene.device
+    vectors = (wp.empty(n, dtype=wp.vec3, device=device) for _ in range(3))
+    mirror = MirrorPixels(NO_REFLECTOR, pixel, *vectors, (0, 0, *gbuffer.camera.size))
     if not n:
-        none = compact.none(wp.vec3, device)
-        return MirrorPixels(reflector, pixel, none, none, none, box)
-    mirror = MirrorPixels(
-        reflector=reflector,
-        pixel=pixel,
-        point=wp.empty(n, dtype=wp.vec3, device=device),
-        normal=wp.empty(n, dtype=wp.vec3, device=device),
-        direction=wp.empty(n, dtype=wp.vec3, device=device),
-        box=box,
-    )
+        return mirror
     seen = [gbuffer.view, gbuffer.triangle, gbuffer.depth_key, mirror.pixel]
     outputs = [mirror.point, mirror.normal, mirror.direction]
     if vector.chosen(kernels, device):
@@ -402,27 +404,29 @@ def part_pixels(
     found = {part: known[part] for part in parts if part in known}
     others = [part for part in parts if part not in known]
     if others:
-        pixels, _ = _pixels_of(scene, gbuffer, dict(enumerate(others, 1)), threads, kernels)
-        for id, part in enumerate(others, 1):
-            found[part] = _met(scene, gbuffer, NO_REFLECTOR, *pixels[id], threads, kernels)
+        pixel, runs, _ = _pixels_of(scene, gbuffer, dict(enumerate(others, 1)), threads, kernels)
+        whole = _met(scene, gbuffer, pixel, threads, kernels)
+        found |= {part: whole.part(NO_REFLECTOR, *runs[id]) for id, part in enumerate(others, 1)}
     return {part: pixels for part, pixels in found.items() if pixels.count}
 
 
 def seen_parts(scene: Scene, gbuffer: GBuffer, parts: Iterable[int], threads: int, kernels: str) -> dict[int, int]:
     """Number of the pixels at which the eye sees each of some parts."""
     asked = dict(enumerate(parts, 1))
-    found, _ = _pixels_of(scene, gbuffer, asked, threads, kernels)
-    return {part: len(found[id][0]) for id, part in asked.items()}
+    _, runs, _ = _pixels_of(scene, gbuffer, asked, threads, kernels)
+    return {part: end - first for part, (first, end, _) in ((part, runs[id]) for id, part in asked.items())}
 
 
-def _pixels_by_id(ids: np.ndarray, wanted: Collection[int]) -> dict[int, np.ndarray]:
-    """Ascending int32 pixel numbers of every id."""
+def _pixels_by_id(ids: np.ndarray, wanted: Collection[int]) -> tuple[np.ndarray, dict[int, tuple[int, int]]]:
+    """Ascending int32 pixel numbers of the least id, then those of the next; where those of each begin and end."""
     # The comparison makes it twice as fast as on the numbers themselves.
     pixel = np.flatnonzero(ids != 0).astype(np.int32)
     if len(wanted) == 1:
-        return dict.fromkeys(wanted, pixel)
+        return pixel, dict.fromkeys(wanted, (0, len(pixel)))
     ids = ids[pixel]
-    return {id: pixel[ids == id] for id in wanted}
+    found = {id: pixel[ids == id] for id in sorted(wanted)}
+    edges = pairwise(np.cumsum([0, *map(len, found.values())]).tolist())
+    return np.concatenate(list(found.values())), dict(zip(found, edges, strict=True))
 
 
 RUN = wp.constant(6)  # numbers of an id's run: first, end; first and last row; columns left of the right end, its end
@@ -477,8 +481,8 @@ def runs_kernel(
         wp.atomic_max(out_run, own * RUN + 5, column + 1)
 
 
-def _sorted_by_id(ids: wp.array, wanted: Collection[int], width: int) -> dict[int, tuple[wp.array, Box]]:
-    """The pixels of every id and their bounds, as `_pixels_by_id` finds them, with nothing read but `RUN` numbers an id."""
+def _sorted_by_id(ids: wp.array, wanted: Collection[int], width: int) -> tuple[wp.array, dict[int, Run]]:
+    """The pixels of every id, as `_pixels_by_id` finds them, with nothing read but `RUN` numbers an id."""
     count, device = len(ids), ids.device
     # The sort wants room for as many again; it keeps the order of what has the same id.
     id, pixel = (wp.empty(2 * count, dtype=int, device=device) for _ in range(2))
@@ -486,11 +490,17 @@ def _sorted_by_id(ids: wp.array, wanted: Collection[int], width: int) -> dict[in
     wp.utils.radix_sort_pairs(id, pixel, count)
     runs = wp.zeros((max(wanted) + 1) * RUN, dtype=int, device=device)
     launch.launch(runs_kernel, count, [count, id, pixel, width, runs], device)
+    read = runs.numpy().reshape(-1, RUN).tolist()
+    # Those of no id lie before the others.
+    begin = min((start for start, end, *_ in read if end > start), default=0)
+    last = max(end for _, end, *_ in read)
     found = {}
-    for k, (start, end, top, bottom, before, right) in enumerate(runs.numpy().reshape(-1, RUN).tolist()):
-        if k in wanted:
-            found[k] = pixel[start:end], (width - before, top, right, bottom + 1) if end > start else (0, 0, 0, 0)
-    return found
+    for k, (start, end, top, bottom, before, right) in enumerate(read):
+        if k in wanted and end > start:
+            found[k] = start - begin, end - begin, (width - before, top, right, bottom + 1)
+        elif k in wanted:
+            found[k] = 0, 0, (0, 0, 0, 0)
+    return compact.run(pixel, begin, last), found
 
 
 @wp.kernel(module=CHANNELS)

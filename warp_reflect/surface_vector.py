@@ -5,8 +5,6 @@ What needs a second look (near a silhouette, without area, a quadric in parallel
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 import warp as wp
 
@@ -278,11 +276,12 @@ def list_blocks_kernel(
 
 def pixels_by_id(
     triangle: wp.array, triangle_patch: wp.array, patch_id: wp.array, ids: int, threads: int
-) -> tuple[wp.array, list[wp.array]]:
+) -> tuple[wp.array, wp.array, list[int]]:
     """Which pixels have each of the ids from 1 on, at most `LISTED_IDS`.
 
     Returns:
-        (id per pixel, int32, 0 none; for each id its pixels, ascending, int32).
+        (id per pixel, int32, 0 none; the pixels of the first id, ascending, then those of the next, int32; where each
+        id's begin, and their end).
     """
     count, device = len(triangle), triangle.device
     id, counts = (wp.empty(n, dtype=int, device=device) for n in (count, ids * vector.block_count(count)))
@@ -291,5 +290,4 @@ def pixels_by_id(
     place = listed(ends - counts.numpy(), device)
     pixel = wp.empty(int(ends[-1]), dtype=int, device=device)
     vector.launch_blocks(list_blocks_kernel, count, [id, place, pixel], device, threads)
-    edges = [0, *ends[vector.block_count(count) - 1 :: vector.block_count(count)].tolist()]
-    return id, [listed(pixel.numpy()[start:end], device) for start, end in pairwise(edges)]
+    return id, pixel, [0, *ends[vector.block_count(count) - 1 :: vector.block_count(count)].tolist()]

@@ -26,7 +26,6 @@ import numpy as np
 import warp as wp
 
 from warp_reflect import bvh, compact, launch, shade, vector
-from warp_reflect.counts import add_statistics
 from warp_reflect.layers import (
     NO_REFLECTOR,
     CameraView,
@@ -643,13 +642,13 @@ def behind(
             total = wp.zeros(count, dtype=wp.vec3, device=device)
         launch.launch(gather_kernel, n, [numbers, own, faded, seen, total], device, threads)
         if depth == settings.transparency_depth:
-            add_statistics(first.statistics, {"depth_limit": len(going)})
+            first.count_later("depth_limit", compact.taken(numbers, going).numpy)
             break
         if not len(going):
             break
-        add_statistics(first.statistics, {"onward": len(going)})
         taken = lambda array: compact.taken(array, going)  # noqa: B023, E731
         numbers, weight = taken(numbers), taken(carried)
+        first.count_later("onward", numbers.numpy)
         fading = taken(still_fading) if len(fading) else fading
         way = taken(way) if len(way) else way
         pixels = MirrorPixels(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from warp_reflect import bvh
@@ -43,15 +44,24 @@ def reflect(
     Returns:
         A layer with status CONVERGED, SKY or STEP_LIMIT; statistics `bvh`: rays traced.
     """
-    layer = ReflectionLayer.unset(pixels, Technique.RAYTRACED, scene.device)
-    layer.statistics["bvh"] = bvh.trace_pixels(
-        scene,
-        gbuffer,
-        pixels,
-        layer,
-        prepared.part,
-        prepared.convex,
-        threads=settings.threads,
-        kernels=settings.kernels,
-    )
-    return layer
+    return reflect_together(scene, [prepared], gbuffer, [pixels], settings)[0]
+
+
+def reflect_together(
+    scene: Scene, prepared: Sequence[Prepared], gbuffer: GBuffer, pixels: Sequence[MirrorPixels], settings: Settings
+) -> list[ReflectionLayer]:
+    """The same of several mirrors, whose pixels follow one another: their layers are slices of a whole."""
+    whole = ReflectionLayer.unset(MirrorPixels.joined(pixels), Technique.RAYTRACED, scene.device)
+    layers = whole.parts(pixels)
+    for mirror, layer in zip(prepared, layers, strict=True):
+        layer.statistics["bvh"] = bvh.trace_pixels(
+            scene,
+            gbuffer,
+            layer.pixels,
+            layer,
+            mirror.part,
+            mirror.convex,
+            threads=settings.threads,
+            kernels=settings.kernels,
+        )
+    return layers
