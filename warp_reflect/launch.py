@@ -44,10 +44,12 @@ MOST_REGISTERS = 168
 SLICE_ALIGN = 64  # elements; slices that share a cache line of results would ping-pong it
 
 # Warp's own default (the option replaces it), without a number type that no kernel has: a third of what its header costs. What
-# the header asks of its templates is made once with it, and not again in every module: 50 ms each.
+# the header asks of its templates is made once with it, and not again in every module: 50 ms each. The last two are what Clang's
+# driver would give a compiler: names of values and a check of its own code it does without, which is a twelfth of the time.
 PLAIN_FLAGS = (
     "-march=native -mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000"
     " -mllvm=-slp-recursion-max-depth=4 -DWP_NO_BFLOAT16 -fpch-instantiate-templates"
+    " -discard-value-names -disable-llvm-verifier"
 )
 # And one flag: without NaN the box test's min and max are single instructions, which makes a query 1.5 to 1.8 times as fast.
 # Warp's headers name NAN: no warnings about that. CUDA builds ignore the option.
