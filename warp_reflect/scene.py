@@ -664,13 +664,13 @@ class Scene:
             scene_from_object = self.scene_from_object(inst)
             flip = np.linalg.det(scene_from_object[:3, :3]) < 0.0
             order = [0, 2, 1] if flip else [0, 1, 2]
-            points.append(placed_points(mesh, scene_from_object))
+            points.append(placed_points(mesh.points, scene_from_object))
             triangles.append(np.take(mesh.triangles, order, axis=1))
             triangles[-1] += np.int32(first_vertex)
             if mesh.normals is None:
                 normal_index.append(np.full((count, 3), -1, np.int32))
             else:
-                normals.append(placed_normals(mesh, scene_from_object))
+                normals.append(placed_normals(mesh.normals, np.linalg.inv(scene_from_object[:3, :3])))
                 index = mesh.triangles if mesh.normal_index is None else mesh.normal_index
                 normal_index.append(np.take(index, order, axis=1))
                 normal_index[-1] += np.int32(first_normal)
@@ -738,16 +738,30 @@ def _stack(arrays: list, empty: tuple, dtype) -> np.ndarray:
     return (arrays[0] if len(arrays) == 1 else np.concatenate(arrays)).astype(dtype, copy=False)
 
 
-def placed_points(mesh: MeshData, scene_from_object: np.ndarray) -> np.ndarray:
-    """A mesh's points in the scene frame, float32."""
-    return (mesh.points.astype(np.float64) @ scene_from_object[:3, :3].T + scene_from_object[:3, 3]).astype(np.float32)
+def placed_points(points: np.ndarray, scene_from_object: np.ndarray) -> np.ndarray:
+    """A mesh's points in the scene frame, float32.
+
+    Args:
+        points: [n, 3].
+        scene_from_object: [4, 4], or [4, 4, n] of points that are placed each for itself, with the same bits.
+    """
+    x, y, z = np.ascontiguousarray(points.T, np.float64)
+    placed = np.empty((len(points), 3), np.float32)
+    for k, row in enumerate(scene_from_object[:3]):
+        placed[:, k] = row[0] * x + row[1] * y + row[2] * z + row[3]
+    return placed
 
 
-def placed_normals(mesh: MeshData, scene_from_object: np.ndarray) -> np.ndarray:
-    """A mesh's normals in the scene frame, float32, of unit length."""
-    normals = mesh.normals.astype(np.float64) @ np.linalg.inv(scene_from_object[:3, :3])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-    return normals.astype(np.float32)
+def placed_normals(normals: np.ndarray, object_from_scene: np.ndarray) -> np.ndarray:
+    """A mesh's normals in the scene frame, float32, of unit length; arguments as for `placed_points`, [3, 3] or [3, 3, n]."""
+    x, y, z = np.ascontiguousarray(normals.T, np.float64)
+    m = object_from_scene
+    turned = [m[0][k] * x + m[1][k] * y + m[2][k] * z for k in range(3)]
+    length = np.maximum(np.sqrt(turned[0] * turned[0] + turned[1] * turned[1] + turned[2] * turned[2]), 1e-300)
+    placed = np.empty((len(normals), 3), np.float32)
+    for k in range(3):
+        placed[:, k] = turned[k] / length
+    return placed
 
 
 def first_rows(data: SceneData) -> tuple[np.ndarray, np.ndarray]:
@@ -766,9 +780,9 @@ def box_corners(points: np.ndarray, first: np.ndarray) -> np.ndarray:
     return np.where(bits[None] == 1, high[:, None], low[:, None])
 
 
-def unit_from_scene(shape: Shape, scene_from_object: np.ndarray) -> np.ndarray:
-    """float32 [4, 4] of an analytic surface."""
-    return (shape.unit_from_object @ np.linalg.inv(scene_from_object)).astype(np.float32)
+def unit_from_scene(unit_from_object: np.ndarray, scene_from_object: np.ndarray) -> np.ndarray:
+    """float32 of an analytic surface, [4, 4], or of several, [n, 4, 4]."""
+    return (unit_from_object @ np.linalg.inv(scene_from_object)).astype(np.float32)
 
 
 def _shape_of(shape: Shape | None, scene_from_object: np.ndarray) -> tuple[int, tuple, np.ndarray]:
@@ -776,7 +790,7 @@ def _shape_of(shape: Shape | None, scene_from_object: np.ndarray) -> tuple[int, 
     if shape is None:
         return SHAPE_NONE, (0.0, 0.0, 0.0), np.eye(4)
     kind = SHAPE_QUADRIC if shape.kind == "quadric" else SHAPE_PLANE
-    return kind, (shape.a, shape.b, shape.c), unit_from_scene(shape, scene_from_object)
+    return kind, (shape.a, shape.b, shape.c), unit_from_scene(shape.unit_from_object, scene_from_object)
 
 
 def reflectance(material: MaterialData) -> tuple[np.ndarray, np.ndarray]:
