@@ -372,23 +372,15 @@ _HEAD = r"""
     (void)few_words; (void)corners_of;
 """
 
-# Beside it, for the rasteriser's snippets: rows of triangles.
-TRIANGLES = r"""
-    auto marks = [bits](I mask) -> unsigned {
-#if defined(__AVX__) && !defined(__AVX512F__)
-        return __builtin_ia32_movmskps256(__builtin_bit_cast(F, mask));
-#else
-        return bits(mask);
-#endif
-    };
-    // The mask of marks. Masks that are kept over a branch are turned into truth values of 16 bits and back; numbers are not.
-    auto marked = [lanes](unsigned marks) -> I { return (I(marks) << (31 - lanes())) < 0; };
-    auto least = [](I p, I q) -> I { return p < q ? p : q; };
-    auto most = [](I p, I q) -> I { return p > q ? p : q; };
-    auto snap = [](F x) -> I { return __builtin_convertvector(__builtin_elementwise_floor(x * 256.0f + 0.5f), I); };
+# Beside it, for what does not go on in all lanes.
+PACKED = r"""
     // Puts the words of the lanes that are marked one after the other; up to LANES words at `to` are written.
     auto packed = [](int* to, I words, unsigned marked) -> int {
-#if defined(__AVX2__)
+#if defined(__AVX512F__)
+        const I together = __builtin_ia32_compresssi512_mask(words, I(0), (unsigned short)marked);
+        __builtin_memcpy(to, &together, sizeof(together));
+        return __builtin_popcount(marked);
+#elif defined(__AVX2__)
         struct Order { unsigned long long of[256]; };
         static constexpr Order order = []() constexpr {
             Order made{};
@@ -416,6 +408,25 @@ TRIANGLES = r"""
         return count;
 #endif
     };
+    (void)packed;
+"""
+
+# For the rasteriser's snippets: rows of triangles.
+TRIANGLES = (
+    PACKED
+    + r"""
+    auto marks = [bits](I mask) -> unsigned {
+#if defined(__AVX__) && !defined(__AVX512F__)
+        return __builtin_ia32_movmskps256(__builtin_bit_cast(F, mask));
+#else
+        return bits(mask);
+#endif
+    };
+    // The mask of marks. Masks that are kept over a branch are turned into truth values of 16 bits and back; numbers are not.
+    auto marked = [lanes](unsigned marks) -> I { return (I(marks) << (31 - lanes())) < 0; };
+    auto least = [](I p, I q) -> I { return p < q ? p : q; };
+    auto most = [](I p, I q) -> I { return p > q ? p : q; };
+    auto snap = [](F x) -> I { return __builtin_convertvector(__builtin_elementwise_floor(x * 256.0f + 0.5f), I); };
     // Triangles on the screen: (x, y, key) of their corners, which of them have a picture, which of those are to be clipped, and
     // of the others snapped corners, 0 where there is none, and the box of pixel centres within a target.
     struct Corners { V v[3]; I kept, clipped, sound, x[3], y[3], left, right, top, bottom, small; };
@@ -454,8 +465,9 @@ TRIANGLES = r"""
     };
     // raster.edge_bias
     auto edge_bias = [](I dx, I dy) -> I { return ((dy < 0) | ((dy == 0) & (dx > 0))) ? I(0) : I(-1); };
-    (void)marks; (void)marked; (void)packed; (void)cornered; (void)edge_bias;
+    (void)marks; (void)marked; (void)cornered; (void)edge_bias;
 """
+)
 
 # After those: one triangle of corners a, b, c into rows of a target, as `raster.draw_triangle` sets it up.
 ONE_TRIANGLE = r"""

@@ -70,7 +70,7 @@ wp.set_module_options({"enable_backward": False})
             const Law law = measure(s, target);
             if (k == 0) {
                 tried &= law.residual < residual_max;
-                x = vpick(tried, step_on_cube(x, s.p, newton_step(s, law), F(1.0f)), x);
+                x = vpick(tried, step_on_cube(x, s.p, newton_step(s, law, target), F(1.0f)), x);
                 continue;
             }
             const F reach = edge_reach(s.p, s.n, target, F(map.least_curvature));

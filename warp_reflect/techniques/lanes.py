@@ -66,12 +66,14 @@ VIRTUAL_VERTEX = r"""
         return matrix(frame.eye_from_unit, sub(q, eye));
     };
     // layers.project, and the answer of one lane
+    typedef unsigned char Bytes __attribute__((ext_vector_type(LANES)));
     unsigned char* status = (unsigned char*)out_vertex.status.data;
     float* screen = (float*)out_vertex.screen.data;
     float* seeds = (float*)out_vertex.seed.data;
     float* positions = (float*)out_vertex.position.data;
     const bool placed = out_vertex.position.shape[0] > 0;
-    auto settle = [&](I done, I answer, I vertex, V seed, F residual, V image, F reach) {
+    struct Answer { I status; F x, y, key, depth, reach, residual; V seed, place; };
+    auto answered = [&](I answer, V seed, F residual, V image, F reach) -> Answer {
         const F depth = dot(spread(camera.forward), image);
         F x = camera.x_row[0] * image.x + camera.x_row[1] * image.y + camera.x_row[2] * image.z + camera.x_row[3];
         F y = camera.y_row[0] * image.x + camera.y_row[1] * image.y + camera.y_row[2] * image.z + camera.y_row[3];
@@ -85,24 +87,29 @@ VIRTUAL_VERTEX = r"""
             x = pick(before, x, x * inv);
             y = pick(before, y, y * inv);
         }
-        const int at = vertex[0];
-        if (bits(done & (vertex == at + lanes())) == bits(I(-1))) {
-            EACH_LANE status[at + l] = (unsigned char)answer[l];
-            store((float*)out_vertex.reach.data + at, reach);
-            store((float*)out_vertex.residual.data + at, residual);
-            vstore4(screen, at, V{x, y, key}, depth);
-            vstore(seeds, at, seed);
-            if (placed) vstore(positions, at, image);
-            return;
-        }
+        return Answer{answer, x, y, key, depth, reach, residual, seed, image};
+    };
+    auto side_by_side = [&](I vertex) -> bool { return bits(vertex == vertex[0] + lanes()) == bits(I(-1)); };
+    // Of vertices side by side, all of which are answered, or are to be answered later, if only by a status.
+    auto put = [&](int at, I done, const Answer& a) {
+        const Bytes byte = __builtin_convertvector(a.status, Bytes);
+        __builtin_memcpy(status + at, &byte, sizeof(byte));
+        float* reach = (float*)out_vertex.reach.data + at;
+        store(reach, pick(done, a.reach, load(reach)));
+        store((float*)out_vertex.residual.data + at, a.residual);
+        vstore4(screen, at, V{a.x, a.y, a.key}, a.depth);
+        vstore(seeds, at, a.seed);
+        if (placed) vstore(positions, at, a.place);
+    };
+    auto put_each = [&](I done, I vertex, const Answer& a) {
         // By memory: the compiler would store a whole vector for every lane that is taken out of it.
-        const F each[9] = {x, y, key, depth, reach, residual, seed.x, seed.y, seed.z};
+        const F each[9] = {a.x, a.y, a.key, a.depth, a.reach, a.residual, a.seed.x, a.seed.y, a.seed.z};
         float lane[9][LANES], place[3][LANES];
         int to[LANES], as[LANES];
         for (int k = 0; k < 9; ++k) store(lane[k], each[k]);
-        store(place[0], image.x); store(place[1], image.y); store(place[2], image.z);
+        store(place[0], a.place.x); store(place[1], a.place.y); store(place[2], a.place.z);
         istore(to, vertex);
-        istore(as, answer);
+        istore(as, a.status);
         for (unsigned left = bits(done); left != 0; left &= left - 1) {
             const int l = __builtin_ctz(left), i = to[l];
             status[i] = (unsigned char)as[l];
@@ -115,6 +122,11 @@ VIRTUAL_VERTEX = r"""
             }
         }
     };
+    auto settle = [&](I done, I answer, I vertex, V seed, F residual, V image, F reach) {
+        const Answer a = answered(answer, seed, residual, image, reach);
+        if (bits(done) == bits(I(-1)) && side_by_side(vertex)) put(vertex[0], done, a);
+        else put_each(done, vertex, a);
+    };
     (void)safe_normalize; (void)safe_length; (void)tangents; (void)edge_reach; (void)virtual_vertex; (void)settle; (void)seeds;
 """
 
@@ -124,7 +136,7 @@ REFLECTOR_MAP = r"""
     const float* texels = (const float*)map.texels.data;
     const int resolution = map.resolution;
     const float scale = 0.5f * (float)(resolution - 1);
-    struct Law { V o, v, w_t; F inv_o, inv_v, w_n, residual, cos_eye, cos_target; };
+    struct Law { F inv_o, inv_v, residual, cos_eye, cos_target; };
     // cubemap.project_to_cube
     auto project_to_cube = [&](V x) -> V {
         const F m = size(x);
@@ -148,7 +160,7 @@ REFLECTOR_MAP = r"""
         return Cell{8 * ((face * resolution + j) * resolution + i),
             fu - __builtin_convertvector(i, F), fv - __builtin_convertvector(j, F)};
     };
-    struct Sample { V p, p_u, p_v, n, n_u, n_v; F mask; Cell cell; };
+    struct Sample { V p, p_u, p_v, n, n_u, n_v; };
     auto sample_cell = [&](const Cell& cell) -> Sample {
         const I at = cell.texel;
         const F a = cell.a, b = cell.b;
@@ -167,7 +179,6 @@ REFLECTOR_MAP = r"""
             by_u = add(times(1.0f - b, d0), times(b, d1));
         };
         Sample s;
-        s.cell = cell;
         V raw, n_u, n_v;
         between(0, s.p, s.p_u, s.p_v);
         between(4, raw, n_u, n_v);
@@ -175,9 +186,12 @@ REFLECTOR_MAP = r"""
         s.n = times(inv, raw);
         s.n_u = times(inv, n_u);
         s.n_v = times(inv, n_v);
-        // reflector_maps.least_mask
-        s.mask = fmin(fmin(t00[3], t01[3]), fmin(t10[3], t11[3]));
         return s;
+    };
+    auto least_mask = [&](V x) -> F {
+        const I at = map_cell(x).texel + 3;
+        const float* below = texels + 8 * resolution;
+        return fmin(fmin(gather(texels, at), gather(texels + 8, at)), fmin(gather(below, at), gather(below + 8, at)));
     };
     auto sample = [&](V x) -> Sample { return sample_cell(map_cell(x)); };
     // reflector_maps.slide
@@ -193,18 +207,19 @@ REFLECTOR_MAP = r"""
         Law law;
         law.inv_o = 1.0f / fmax(length(to_eye), F(1.0e-20f));
         law.inv_v = 1.0f / fmax(length(to_target), F(1.0e-20f));
-        law.o = times(law.inv_o, to_eye);
-        law.v = times(law.inv_v, to_target);
-        law.cos_eye = dot(s.n, law.o);
-        law.cos_target = dot(s.n, law.v);
-        law.w_n = law.cos_eye + law.cos_target;
-        law.w_t = sub(add(law.o, law.v), times(law.w_n, s.n));
-        law.residual = pick(law.w_n > normal_part_min, length(law.w_t) * (1.0f / law.w_n), 1.0e4f - law.w_n);
+        const V o = times(law.inv_o, to_eye), v = times(law.inv_v, to_target);
+        law.cos_eye = dot(s.n, o);
+        law.cos_target = dot(s.n, v);
+        const F w_n = law.cos_eye + law.cos_target;
+        const V w_t = sub(add(o, v), times(w_n, s.n));
+        law.residual = pick(w_n > normal_part_min, length(w_t) * (1.0f / w_n), 1.0e4f - w_n);
         return law;
     };
-    auto newton_step = [&](const Sample& s, const Law& law) -> V {
-        const V o = law.o, v = law.v, w_t = law.w_t, n = s.n;
-        const F inv_o = law.inv_o, inv_v = law.inv_v, n_o = law.cos_eye, n_v = law.cos_target, w_n = law.w_n;
+    // Directions are calculated again: what a vector keeps of an evaluation takes as long to write as to find.
+    auto newton_step = [&](const Sample& s, const Law& law, V target) -> V {
+        const F inv_o = law.inv_o, inv_v = law.inv_v, n_o = law.cos_eye, n_v = law.cos_target, w_n = n_o + n_v;
+        const V n = s.n, o = times(inv_o, sub(eye, s.p)), v = times(inv_v, sub(target, s.p));
+        const V w_t = sub(add(o, v), times(w_n, n));
         const F n_1 = dot(n, s.p_u), n_2 = dot(n, s.p_v);
         const F o1 = dot(o, s.p_u) - n_o * n_1, o2 = dot(o, s.p_v) - n_o * n_2;
         const F v1 = dot(v, s.p_u) - n_v * n_1, v2 = dot(v, s.p_v) - n_v * n_2;
@@ -243,5 +258,5 @@ REFLECTOR_MAP = r"""
             cap = fmin(cap, step_cap * length(whitened) / fmax(length(move), F(1.0e-30f)));
         return project_to_cube(add(times(size(whitened), x), times(cap * shrink, move)));
     };
-    (void)slide; (void)sample;
+    (void)slide; (void)sample; (void)least_mask;
 """

@@ -45,7 +45,8 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
 
 @wp.func_native(
     vector.snippet(
-        VIRTUAL_VERTEX
+        vector.PACKED
+        + VIRTUAL_VERTEX
         + REFLECTOR_MAP
         + r"""
     const int count = points.shape[0];
@@ -60,15 +61,21 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
 // Between what is read and what is written of a row: the compiler would make masked stores of them, which are slow.
 #define KEEP_APART(row) asm volatile("" : : "r"(&row) : "memory");
     struct Search {
-        V target, x, best, p, n, step;
+        const float* row;
+        V x, best, p, n, step;
         F residual, shrink;
         I asked, going, better, near, later, used;
-        Cell cell;
+        Cell cells[2];  // of this evaluation and of the next, in turn
         Sample s;
         Law law;
     };
     constexpr int ROWS = BLOCK / LANES;
     Search group[ROWS];
+    Search unasked;  // what is known before the first evaluation
+    unasked.residual = F(1.0e30f);
+    unasked.shrink = F(1.0f);
+    unasked.used = I(0);
+    unasked.best = unasked.p = unasked.n = unasked.step = same(0.0f);
     // map_search.search_newton. A vector goes on while more than FEW of its lanes do: the others go on side by side after the
     // last block, and then those that ended far from a root start again from a coarse seed.
     for (int round = 0; round < BLOCKS + 2; ++round) {
@@ -78,14 +85,19 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
             const int begin = (task * BLOCKS + round) * BLOCK;
             const int end = begin + BLOCK < count ? begin + BLOCK : count;
             for (int start = begin; start < end; start += LANES) {
+                const bool full = end - start >= LANES;
                 const I element = start + lanes();
                 const I valid = element < end;
                 const I own = ipick(valid, element, I(end - 1));
                 I known;
-                EACH_LANE known[l] = status[own[l]];
+                if (full) {
+                    Bytes byte;
+                    __builtin_memcpy(&byte, status + start, sizeof(byte));
+                    known = __builtin_convertvector(byte, I);
+                } else EACH_LANE known[l] = status[own[l]];
                 I asked = valid & (known == 0) & ~((own >= own_first) & (own < own_first + own_count));
                 if (!bits(asked)) continue;
-                const V point = vrows((const float*)points.data, start, end - start >= LANES, own);
+                const V point = vrows((const float*)points.data, start, full, own);
                 const V target = add(matrix(frame.unit_from_scene, point), spread(frame.unit_offset));
                 // map_search.is_visible
                 const V white = product(target, inv_extent);
@@ -127,7 +139,7 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
                 asked &= visible;
                 if (!bits(asked)) continue;
                 V seed = same(0.0f);
-                if (warm != 0) seed = vrows(seeds, start, end - start >= LANES, own);
+                if (warm != 0) seed = vrows(seeds, start, full, own);
                 const I unknown = size(seed) == 0.0f;
                 seed = project_to_cube(seed);
                 if (bits(asked & unknown)) {
@@ -138,18 +150,14 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
                     seed = vpick(unknown, project_to_cube(vpick(size(w) < 1.0e-6f, white_eye, w)), seed);
                 }
                 const F each[6] = {target.x, target.y, target.z, seed.x, seed.y, seed.z};
-                if (bits(asked) == bits(I(-1))) {
+                const unsigned here = bits(asked);
+                if (here == bits(I(-1))) {
                     for (int k = 0; k < 6; ++k) store(at[k] + searched, each[k]);
                     istore(vertex_of + searched, own);
                     searched += LANES;
                 } else {
-                    float lane[6][LANES];
-                    for (int k = 0; k < 6; ++k) store(lane[k], each[k]);
-                    for (unsigned left = bits(asked); left != 0; left &= left - 1) {
-                        const int l = __builtin_ctz(left);
-                        for (int k = 0; k < 6; ++k) at[k][searched] = lane[k][l];
-                        vertex_of[searched++] = start + l;
-                    }
+                    for (int k = 0; k < 6; ++k) packed((int*)at[k] + searched, __builtin_bit_cast(I, each[k]), here);
+                    searched += packed(vertex_of + searched, own, here);
                 }
             }
         }
@@ -211,6 +219,7 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
         for (int from = 0; from < searched; from += BLOCK) {
             const int vectors = searched - from < BLOCK ? (searched - from + LANES - 1) / LANES : ROWS;
             int open[ROWS], opened = vectors;
+            bool begun = in_few;
             for (int k = 0; k < vectors; ++k) {
                 Search& g = group[k];
                 const int start = from + k * LANES;
@@ -219,12 +228,9 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
                     return V{load(row + k * ROW), load(row + (k + 1) * ROW), load(row + (k + 2) * ROW)};
                 };
                 g.asked = g.going = start + lanes() < searched;
-                g.target = at_row(0);
+                g.row = row;
                 g.x = at_row(X);
-                g.residual = F(1.0e30f);
-                g.shrink = F(1.0f);
-                g.later = g.used = I(0);
-                g.best = g.p = g.n = g.step = same(0.0f);
+                g.later = I(0);
                 if (in_few) {
                     g.best = at_row(BEST);
                     g.p = at_row(P);
@@ -234,21 +240,25 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
                     g.shrink = load(row + SHRINK * ROW);
                     g.used = iload(few_used + start);
                 }
-                g.cell = map_cell(g.x);
+                g.cells[0] = map_cell(g.x);
                 open[k] = k;
             }
-            while (opened > 0) {
+            auto target_of = [&](const Search& g) -> V { return V{load(g.row), load(g.row + ROW), load(g.row + 2 * ROW)}; };
+            for (int turn = 0; opened > 0; turn ^= 1) {
                 // Of all vectors the samples, then how good they are, then the steps, then, of those near a root, their ends.
                 int on = 0, near_root[ROWS], near_count = 0;
-                for (int k = 0; k < opened; ++k) group[open[k]].s = sample_cell(group[open[k]].cell);
+                for (int k = 0; k < opened; ++k) group[open[k]].s = sample_cell(group[open[k]].cells[turn]);
                 for (int k = 0; k < opened; ++k) {
                     Search& g = group[open[k]];
-                    g.law = measure(g.s, g.target);
+                    const Search& known = begun ? g : unasked;
+                    g.law = measure(g.s, target_of(g));
                     const F here = g.law.residual;
-                    const I better = g.going & (here < g.residual);
-                    const V best = vpick(better, g.x, g.best), p = vpick(better, g.s.p, g.p), n = vpick(better, g.s.n, g.n);
-                    const F residual = pick(better, here, g.residual), shrink = pick(better, F(1.0f), g.shrink * retry_shrink);
-                    const I used = g.used + 1;
+                    const I better = g.going & (here < known.residual);
+                    const V best = vpick(better, g.x, known.best);
+                    const V p = vpick(better, g.s.p, known.p), n = vpick(better, g.s.n, known.n);
+                    const F residual = pick(better, here, known.residual);
+                    const F shrink = pick(better, F(1.0f), known.shrink * retry_shrink);
+                    const I used = known.used + 1;
                     const F least = pick(residual <= accepted, F(shrink_near), F(shrink_min));
                     const I unended = ~(residual <= settings.tolerance) & (shrink >= least);
                     const I going = g.going & unended & (used < settings.iterations);
@@ -271,7 +281,7 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
                 opened = on;
                 for (int k = 0; k < opened; ++k) {
                     Search& g = group[open[k]];
-                    const V step = vpick(g.better, newton_step(g.s, g.law), g.step);
+                    const V step = vpick(g.better, newton_step(g.s, g.law, target_of(g)), (begun ? g : unasked).step);
                     KEEP_APART(g)
                     g.step = step;
                 }
@@ -280,15 +290,16 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
                     const V x = vpick(g.going, step_on_cube(g.best, g.p, g.step, g.shrink), g.x);
                     KEEP_APART(g)
                     g.x = x;
-                    g.cell = map_cell(x);
+                    g.cells[turn ^ 1] = map_cell(x);
                 }
+                begun = true;
                 for (int k = 0; k < near_count; ++k) {
                     Search& g = group[near_root[k]];
-                    const Cell cell = g.cell;
-                    const F along_u = cell.a - g.s.cell.a, along_v = cell.b - g.s.cell.b;
+                    const Cell from = g.cells[turn], to = g.cells[turn ^ 1];
+                    const F along_u = to.a - from.a, along_v = to.b - from.b;
                     const Sample end = slide(g.s, along_u, along_v);
-                    const F there = measure(end, g.target).residual;
-                    const I ended = g.near & (cell.texel == g.s.cell.texel) & (magnitude(along_u * along_v) <= twist_max)
+                    const F there = measure(end, target_of(g)).residual;
+                    const I ended = g.near & (to.texel == from.texel) & (magnitude(along_u * along_v) <= twist_max)
                         & (there <= settings.tolerance);
                     const V best = vpick(ended, g.x, g.best), p = vpick(ended, end.p, g.p), n = vpick(ended, end.n, g.n);
                     const F residual = pick(ended, there, g.residual);
@@ -312,7 +323,7 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
             for (int k = 0; k < vectors; ++k) {
                 const Search& g = group[k];
                 const int start = from + k * LANES;
-                const V target = g.target, best = g.best, p = g.p, n = g.n;
+                const V target = target_of(g), best = g.best, p = g.p, n = g.n;
                 const F residual = g.residual;
                 const I asked = g.asked, later = g.later, vertex = iload(numbers + start);
                 if (bits(later)) {
@@ -330,7 +341,7 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
                     }
                 }
                 I done = asked & ~later & (residual <= accepted), answer = I(converged);
-                I rest = asked & ~later & ~done;
+                I rest = asked & ~later & ~done, nothing = I(0);
                 if (bits(rest) && !in_coarse) {
                     // map_search.is_straight
                     const V to_eye = sub(eye, p), to_target = sub(target, p);
@@ -348,10 +359,10 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
                     // map_search.solve_vertex: what is not near a root.
                     const Sample s = sample(best);
                     const Law law = measure(s, target);
-                    const I closing = s.mask < 0.5f, off = residual > map.accepted;
+                    const I closing = least_mask(best) < 0.5f, off = residual > map.accepted;
                     const I grazing = ~(fmin(law.cos_eye, law.cos_target) >= grazing_cos);
                     const I without = ipick(grazing, I(hidden), ipick(closing, I(unreflected), I(max_iterations)));
-                    const I nothing = rest & off & ((without != max_iterations) | (residual > settings.accepted));
+                    nothing = rest & off & ((without != max_iterations) | (residual > settings.accepted));
                     int as[LANES];
                     float lane[4][LANES];
                     istore(as, without);
@@ -369,7 +380,11 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
                 }
                 if (!bits(done)) continue;
                 const F reach = edge_reach(p, n, target, F(map.least_curvature));
-                settle(done, answer, vertex, best, residual, virtual_vertex(p, n, target), reach);
+                const Answer a = answered(answer, best, residual, virtual_vertex(p, n, target), reach);
+                // Lanes that are answered later may be written to.
+                const I open = placed ? done : asked & ~nothing;
+                if (bits(open) == bits(I(-1)) && side_by_side(vertex)) put(vertex[0], done, a);
+                else put_each(done, vertex, a);
             }
         }
     }
