@@ -140,14 +140,33 @@ HITS = r"""
                 return at;
             }
         }
-        EACH_LANE at.has[l] = index[3 * t.of[l]];
-        at.has = at.has >= 0;
+        // Of the last triangle and the last value there are but three numbers to read.
+        const I own = iload(t.of);
+        I named[3];
+        if (!bits(own >= indices.shape[0] - 1)) {
+            int first[LANES];
+            F numbers[4];
+            istore(first, 3 * own);
+            fours((const float*)index, first, numbers);
+            for (int k = 0; k < 3; ++k) named[k] = __builtin_bit_cast(I, numbers[k]);
+        } else {
+            for (int k = 0; k < 3; ++k) EACH_LANE named[k][l] = index[3 * t.of[l] + k];
+        }
+        at.has = named[0] >= 0;
         if (!bits(at.has)) return at;
+        const int last = values.shape[0] - 1;
+        const bool at_end = bits((named[0] >= last) | (named[1] >= last) | (named[2] >= last)) != 0;
         auto corner = [&](int k) -> V {
+            int start[LANES];
+            istore(start, 3 * ipick(named[k] < 0, I(0), named[k]));
+            if (!at_end) {
+                F of[4];
+                fours(value, start, of);
+                return V{of[0], of[1], of[2]};
+            }
             V v;
             EACH_LANE {
-                const int i = index[3 * t.of[l] + k];
-                const float* q = value + 3 * (i < 0 ? 0 : i);
+                const float* q = value + start[l];
                 v.x[l] = q[0]; v.y[l] = q[1]; v.z[l] = q[2];
             }
             return v;
