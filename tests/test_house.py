@@ -34,7 +34,7 @@ FLOORS = {
     3: "solve solver solve_device solve_plane solve_convex solve_map solve_general solve_qim solver_gradients mirrors "
     "refraction solve_refraction solver_arrays reflector_maps techniques techniques.* finishes finishes.*",
     4: "kernels planner plan_rows detail mirrored_eyes effects lighting probe budget choice applicable calibration calibrate "
-    "realised bake frame motion virtual_objects seen sweep sweep_report",
+    "realised bake frame captured motion virtual_objects seen sweep sweep_report",
     5: "__main__ cli warmup viewer viewer.* pipeline process progress cluster farm",
 }
 # Where an imported library may appear, inside functions or out.

@@ -2,9 +2,11 @@
 
     python tools/device_frames.py usd_scenes/one_mirror.usda usd_scenes/kitchen.usda --set shadows=off
     python tools/device_frames.py usd_scenes/one_mirror.usda --method quadric --size 1920x1080 --kernels 20
+    python tools/device_frames.py usd_scenes/one_mirror.usda --method reference --set bounces=1
 
 The camera walks to the side; frames are waited for one by one. The device's work is that of one frame, every kernel, fill and
-copy in it: below the wall's time, the device waits for the host.
+copy in it: below the wall's time, the device waits for the host. A second line, `captured`, is that of the same frames as one
+graph (`wr.capture_frame`), or says why there is none.
 """
 
 from __future__ import annotations
@@ -14,13 +16,16 @@ import statistics
 import sys
 import time
 from collections import defaultdict
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import warp as wp
 
 import warp_reflect as wr
+from warp_reflect import captured
 from warp_reflect.devices import open_device
 
 STEP = 1.0e-4  # of the distance to the scene's origin: how far the eye moves between frames
@@ -47,7 +52,7 @@ def main() -> None:
         scene = wr.load_stage(stage, device=str(device))
         settings = wr.Settings(keep_static=False).replace(**asked)
         plan = wr.make_plan(scene, size=size, settings=settings, method=arguments.method)
-        wall, host, steps, work = timed(scene, plan, arguments.frames)
+        wall, host, steps, work = timed(scene, plan, arguments.frames, partial(wr.render_frame, scene, plan))
         techniques = ", ".join(sorted({row.technique for row in plan.rows}))
         total, count = sum(ms for _, ms in work.values()), sum(times for times, _ in work.values())
         print(
@@ -56,17 +61,32 @@ def main() -> None:
         print("  " + ", ".join(f"{step} {ms:.2f}" for step, ms in steps.items()))
         for name, (times, ms) in sorted(work.items(), key=lambda item: -item[1][1])[: arguments.kernels]:
             print(f"  {ms:8.3f} ms {times:4d} times {name}")
+        why = captured.why_not(scene, plan)
+        if why:
+            print(f"  captured: none, {why}")
+            continue
+        wall, host, _, work = timed(scene, plan, arguments.frames, wr.capture_frame(scene, plan).render)
+        total = sum(ms for _, ms in work.values())
+        print(f"  captured: {wall:.2f} ms, the host {host:.2f}, the device {total:.2f}")
 
 
-def timed(scene: wr.Scene, plan: wr.Plan, frames: int) -> tuple[float, float, dict, dict]:
-    """Medians of a frame until it is done, and until the host is; of its steps; name to (times, ms) of the device's work."""
+def timed(
+    scene: wr.Scene, plan: wr.Plan, frames: int, draw: Callable[..., wr.Frame]
+) -> tuple[float, float, dict, dict]:
+    """Medians of a frame until it is done, and until the host is; of its steps; name to (times, ms) of the device's work.
+
+    Args:
+        scene, plan: What is drawn.
+        frames: Those timed.
+        draw: (camera, previous frame) -> frame.
+    """
     wall, host, steps, frame = [], [], defaultdict(list), None
     distance = np.linalg.norm(plan.camera.eye - scene.origin)
     for k in range(WARM_UP + frames):
         view = replace(plan.camera, eye=plan.camera.eye + STEP * k * distance * plan.camera.right)
         wp.synchronize_device(scene.device)
         start = time.perf_counter()
-        frame = wr.render_frame(scene, plan, view, previous=frame)
+        frame = draw(view, previous=frame)
         left = time.perf_counter()
         wp.synchronize_device(scene.device)
         if k >= WARM_UP:
@@ -75,7 +95,7 @@ def timed(scene: wr.Scene, plan: wr.Plan, frames: int) -> tuple[float, float, di
             for step, ms in frame.timings.items():
                 steps[step].append(ms)
     wp.timing_begin(cuda_filter=wp.TIMING_ALL)
-    wr.render_frame(scene, plan, plan.camera, previous=frame)
+    draw(plan.camera, previous=frame)
     work: dict[str, tuple[int, float]] = {}
     for result in wp.timing_end():
         times, ms = work.get(result.name, (0, 0.0))

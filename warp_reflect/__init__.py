@@ -11,6 +11,7 @@ __version__ = "0.1.0"
 # Name to module; imported when first asked for, so that `import warp_reflect` stays light.
 _HOME = {
     "Camera": "layers",
+    "CapturedFrame": "captured",
     "Frame": "frame",
     "Plan": "planner",
     "PlanarMirror": "mirrors",
@@ -22,6 +23,7 @@ _HOME = {
     "Solution": "solver",
     "Status": "settings",
     "Technique": "settings",
+    "capture_frame": "captured",
     "compare_frames": "metrics",
     "load_stage": "stage.load",
     "make_plan": "planner",

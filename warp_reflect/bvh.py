@@ -27,6 +27,7 @@ from warp_reflect.settings import Status
 from warp_reflect.trees import Tree, resting_tree
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FINITE_FLAGS})
+NONE = wp.constant(int(Status.NONE))
 FREE, OWN, ONWARD, BOUNCED = (
     launch.module_part(__name__, name, cpu_compiler_flags=FINITE_FLAGS) for name in ("free", "own", "onward", "bounced")
 )
@@ -82,7 +83,7 @@ def trace_pixels_kernel(
     out_distance: wp.array(dtype=float),
     out_status: wp.array(dtype=wp.uint8),
 ):
-    """One thread per asked mirror pixel.
+    """One thread per asked mirror pixel; nothing is met where its number is -1.
 
     `known` is 1 for what `bvh_vector.first_met` has left. With a `status` a miss beside a hit, or without a neighbour, is asked
     again: a kernel of its own would be compiled for as long as this one.
@@ -92,6 +93,13 @@ def trace_pixels_kernel(
         i = index[i]
         if i < 0:
             return
+    if pixel[i] < 0:
+        out_triangle[i] = -1
+        out_u[i] = 0.0
+        out_v[i] = 0.0
+        out_distance[i] = 0.0
+        out_status[i] = wp.uint8(NONE)
+        return
     retry = status.shape[0]
     ray = direction[i]
     if retry != 0:

@@ -12,7 +12,7 @@ from functools import cache
 import numpy as np
 import warp as wp
 
-from warp_reflect.launch import launch, stays
+from warp_reflect.launch import launch, reads, stays
 
 wp.set_module_options({"enable_backward": False})
 
@@ -68,6 +68,8 @@ def marked(marks: wp.array, value: int) -> wp.array:
         return listed(np.flatnonzero(marks.numpy() == np.uint8(value)), marks.device)
     if not len(marks):
         return wp.empty(0, dtype=int, device=marks.device)
+    if not reads():
+        raise RuntimeError("marked: a list's length is asked for where nothing is read; expected padded")
     numbers, ends = _listed(marks, value)
     return numbers[: int(ends[len(ends) - 1 :].numpy()[0])]
 

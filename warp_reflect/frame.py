@@ -52,6 +52,7 @@ class Frame:
             `empty`, `bvh`; vertices; ...; the largest bounds: `reused_px`.
         timings: Milliseconds per stage.
         kept: Ids of the reflectors whose layer is the previous frame's own, as nothing had moved.
+        gone: Whether a `CapturedFrame` has drawn another one over this: nothing can be asked of it any more.
     """
 
     def __init__(
@@ -59,11 +60,12 @@ class Frame:
         scene: Scene,
         plan: Plan,
         gbuffer: GBuffer,
-        layers: dict[int, ReflectionLayer],
+        layers: Mapping[int, ReflectionLayer],
         picture: tuple,
         timings: Mapping[str, float],
         previous: Frame | None = None,
         transmitted: dict[int, transmission.Transmission] | None = None,
+        kept: frozenset[int] = frozenset(),
     ):
         # Not the previous frame itself: each would keep the one before it alive.
         self._before = None if previous is None else (previous.scene, previous.camera)
@@ -71,8 +73,9 @@ class Frame:
         self.camera: Camera = gbuffer.camera
         self._timings = timings
         self._picture = picture
-        self.kept = _kept(layers, previous)
+        self.kept = kept
         self.transmitted = transmitted or {}
+        self.gone = False
 
     @cached_property
     def timings(self) -> dict[str, float]:
@@ -224,6 +227,8 @@ class Frame:
         return image.reshape(height, width, *image.shape[1:])
 
     def _on_device(self, group: str) -> wp.array:
+        if self.gone:
+            raise RuntimeError(f"'{group}': the next captured frame was drawn over this one; ask before that")
         if group == "RGBA":
             return self._picture[0]
         if group == "reflection":
@@ -298,7 +303,7 @@ def render_frame(scene: Scene, plan: Plan, camera: str | Camera | None = None, p
                 transmitted = _look_through(scene, plan, shown, interfaces, met, surfaces, picture)
     for id in layers.keys() - kept:
         timer.count_inside("reflect", layers[id].timings)
-    return Frame(scene, plan, gbuffer, layers, picture, timer.ms, previous, transmitted)
+    return Frame(scene, plan, gbuffer, layers, picture, timer.ms, previous, transmitted, kept)
 
 
 def reflect_scene(

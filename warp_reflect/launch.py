@@ -66,6 +66,7 @@ _measured: dict[tuple[wp.Kernel, int], float] = {}
 _made: dict[wp.Kernel, wp.Launch] = {}
 _recordings: list[list[tuple[str, int]]] = []
 _as_device: list[bool] = []
+_unread = threading.local()
 _loaded: dict[tuple, Future] = {}
 _loading = [0.0]
 
@@ -98,7 +99,26 @@ def stays(device) -> bool:
     A launch there goes over all that might be asked for, and its threads look at the number; on the CPU a number is at hand,
     and threads that find nothing to do cost as much as others.
     """
-    return bool(_as_device) or wp.get_device(device).is_cuda
+    return bool(_as_device) or not reads() or wp.get_device(device).is_cuda
+
+
+def reads() -> bool:
+    """Whether a device may be asked for a number: not where its work is only written down (`unread`)."""
+    return not getattr(_unread, "depth", 0)
+
+
+@contextmanager
+def unread() -> Iterator[None]:
+    """In the context the calling thread reads nothing from a device, whose work is written down to be done later, and again.
+
+    Launches go over the most that there can be, and their threads look at what there is. A CPU goes a CUDA device's way
+    (`stays`), with plain kernels.
+    """
+    _unread.depth = getattr(_unread, "depth", 0) + 1
+    try:
+        yield
+    finally:
+        _unread.depth -= 1
 
 
 @contextmanager

@@ -213,6 +213,8 @@ class MirrorPixels:
         direction: vec3 [n], unit reflected direction.
         box: (x0, y0, x1, y1), half-open bounds of the pixels.
         whole: Those of several reflectors, one after the other, whose slice from `first` on these are; None: they are alone.
+        run: Where nothing is read (`launch.unread`) there are as many entries as the picture has pixels, of which those
+            without a pixel have the number -1; which ones have one is on the device (`surface.told`). None: all of them.
     """
 
     reflector: int
@@ -223,6 +225,7 @@ class MirrorPixels:
     box: Box
     whole: MirrorPixels | None = None
     first: int = 0
+    run: wp.array | None = None
 
     @property
     def count(self) -> int:

@@ -146,6 +146,13 @@ def mirrored_normals_kernel(
     out_normals[i] = mapped_normal(scene, textures, triangle[i], u[i], v[i], direction[i], width)
 
 
+def _marked(ids: Collection[int], device) -> wp.array:
+    """By id from 0 on: 1 for those, int32."""
+    marked = np.zeros(max(ids, default=-1) + 1, np.int32)
+    marked[list(ids)] = 1
+    return wp.array(marked, dtype=int, device=device)
+
+
 def prepare_normals(
     scene: Scene,
     gbuffer: GBuffer,
@@ -172,9 +179,8 @@ def prepare_normals(
     if layer is None:
         normals = wp.zeros(len(gbuffer.triangle), dtype=wp.vec3, device=scene.device)
         inputs = [scene.view, gbuffer.view, textures, gbuffer.triangle, gbuffer.reflector_id]
-        marked = np.zeros(max(bumpy, default=-1) + 1, np.int32)
-        marked[list(bumpy)] = 1
-        inputs += [wp.array(marked, dtype=int, device=scene.device), normals]
+        marked = scene.kept("bumpy reflectors", sorted(bumpy), lambda: _marked(bumpy, scene.device))
+        inputs += [marked, normals]
         launch.launch(eye_normals_kernel, len(normals), inputs, scene.device, threads)
         return normals
     pixels = layer.pixels

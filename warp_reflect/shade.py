@@ -485,9 +485,11 @@ def mirror_term_kernel(
     out_picture: wp.array(dtype=wp.vec4),
     out_mirror: wp.array(dtype=wp.vec3),
 ):
-    """One thread per mirror pixel; finds the mirror's weight in `out_mirror`."""
+    """One thread per mirror pixel, but for the number -1; finds the mirror's weight in `out_mirror`."""
     i = first + wp.tid()
     p = pixel[i]
+    if p < 0:
+        return
     term = wp.cw_mul(out_mirror[p], radiance[i])
     out_mirror[p] = term
     out_picture[p] += wp.vec4(term[0], term[1], term[2], 0.0)

@@ -144,7 +144,8 @@ def shared_share(around: Neighbours, starts: Starts, k: int, place: int, i: int)
 def image_index_kernel(first: int, pixel: wp.array(dtype=int), out_index: wp.array(dtype=int)):
     """One thread per point of a mirror: where it lies in the image."""
     i = first + wp.tid()
-    out_index[pixel[i]] = i
+    if pixel[i] >= 0:
+        out_index[pixel[i]] = i
 
 
 def neighbours_of(points: Points, area_count: int, shared: bool, threads: int = 0) -> Neighbours:

@@ -15,7 +15,7 @@ import warp as wp
 
 from warp_reflect import compact, vector
 from warp_reflect.direct import DirectView, Points, area_irradiance
-from warp_reflect.launch import launch, module_part
+from warp_reflect.launch import launch, module_part, reads
 from warp_reflect.ray_walk import ray_offset, scene_facet_normal
 from warp_reflect.scene import SHAPE_QUADRIC, Scene, SceneView
 from warp_reflect.surface import hit_normal, shown_normal
@@ -179,9 +179,11 @@ def row_vector(rows: wp.array2d(dtype=float), row: int, i: int) -> wp.vec3:
 def kept_room(scene: Scene, count: int) -> Iterator[wp.array | None]:
     """Memory for the rows of so many points, which the scene keeps for the next ones; None on CUDA, which has a pool for it.
 
+    None also for work that is done again and again: by then it may be another's.
+
     Memory of this size is given back to a CPU's system at once, and touching as much anew costs more than filling it.
     """
-    if scene.device.is_cuda:
+    if scene.device.is_cuda or not reads():
         yield None
         return
     words = (int(ROWS) + PLACE_ROWS) * vector.BLOCK * vector.block_count(count)

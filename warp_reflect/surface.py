@@ -7,6 +7,7 @@ normal, or for a gprim the analytic surface behind the facet, met by the eye ray
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -290,8 +291,13 @@ def mirror_pixels_kernel(
     out_normal: wp.array(dtype=wp.vec3),
     out_direction: wp.array(dtype=wp.vec3),
 ):
-    """One thread per mirror pixel."""
+    """One thread per mirror pixel; nothing where the number is -1."""
     i = first + wp.tid()
+    if pixel[i] < 0:
+        out_point[i] = wp.vec3(0.0, 0.0, 0.0)
+        out_normal[i] = wp.vec3(0.0, 0.0, 0.0)
+        out_direction[i] = wp.vec3(0.0, 0.0, 0.0)
+        return
     mirror_pixel(scene, camera, triangle, depth_key, pixel[i], i, out_point, out_normal, out_direction)
 
 
@@ -308,12 +314,15 @@ def mirror_pixels(
         kernels: `Settings.kernels`.
 
     Returns:
-        (`MirrorPixels` per id, of length 0 where a reflector is not seen; reflector id per pixel, int32
-        [height * width], 0 none).
+        (`MirrorPixels` per id, of length 0 where a reflector is not seen, or see there where nothing is read; reflector id
+        per pixel, int32 [height * width], 0 none).
     """
     width, height = gbuffer.camera.size
     if not parts:
         return {}, wp.zeros(width * height, dtype=int, device=scene.device)
+    if not launch.reads():
+        ids = _ids(scene, gbuffer, parts, threads, "reflectors")
+        return _unread_pixels(scene, gbuffer, ids, parts), ids
     pixel, runs, reflector_id = _pixels_of(scene, gbuffer, parts, threads, kernels, "reflectors")
     whole = _met(scene, gbuffer, pixel, threads, kernels)
     return {id: whole.part(id, *runs[id]) for id in parts}, reflector_id
@@ -328,20 +337,27 @@ def _pixels_of(
         (these pixels, part after part, ascending in each; where among them those of each id are; id per pixel, 0 where there
         is none of the parts).
     """
-    width, height = gbuffer.camera.size
-    inputs = [gbuffer.triangle, scene.view.triangle_patch, _id_of_patch(scene, parts, who)]
+    width = gbuffer.camera.size[0]
     if vector.chosen(kernels, scene.device) and not launch.stays(scene.device):
         from warp_reflect import surface_vector  # which reflects at this module's surface
 
         if max(parts) <= surface_vector.LISTED_IDS:
+            inputs = [gbuffer.triangle, scene.view.triangle_patch, _id_of_patch(scene, parts, who)]
             ids, pixel, edges = surface_vector.pixels_by_id(*inputs, max(parts), threads)
             return pixel, _runs(pixel.numpy(), {id: (edges[id - 1], edges[id]) for id in parts}, width), ids
-    ids = wp.empty(width * height, dtype=int, device=scene.device)
-    launch.launch(reflector_id_kernel, width * height, [*inputs, ids], scene.device, threads)
+    ids = _ids(scene, gbuffer, parts, threads, who)
     if launch.stays(scene.device):
         return *_sorted_by_id(ids, parts, width), ids
     pixel, ends = _pixels_by_id(ids.numpy(), parts)
     return compact.listed(pixel, scene.device), _runs(pixel, ends, width), ids
+
+
+def _ids(scene: Scene, gbuffer: GBuffer, parts: Mapping[int, int], threads: int, who: str) -> wp.array:
+    """Id per pixel."""
+    ids = wp.empty(len(gbuffer.triangle), dtype=int, device=scene.device)
+    inputs = [gbuffer.triangle, scene.view.triangle_patch, _id_of_patch(scene, parts, who), ids]
+    launch.launch(reflector_id_kernel, len(ids), inputs, scene.device, threads)
+    return ids
 
 
 def _runs(pixel: np.ndarray, ends: Mapping[int, tuple[int, int]], width: int) -> dict[int, Run]:
@@ -481,23 +497,73 @@ def runs_kernel(
         wp.atomic_max(out_run, own * RUN + 5, column + 1)
 
 
-def _sorted_by_id(ids: wp.array, wanted: Collection[int], width: int) -> tuple[wp.array, dict[int, Run]]:
-    """The pixels of every id, as `_pixels_by_id` finds them, with nothing read but `RUN` numbers an id."""
+@wp.kernel(module=SORTED)
+def own_pixels_kernel(
+    first: int,
+    id: wp.array(dtype=int),
+    pixel: wp.array(dtype=int),
+    least: int,
+    most: int,
+    out_pixel: wp.array(dtype=int),
+):
+    """One thread per pixel, sorted by id: it, or -1 where its id is another."""
+    i = first + wp.tid()
+    out_pixel[i] = wp.where(id[i] >= least and id[i] <= most, pixel[i], -1)
+
+
+def _sorted(ids: wp.array, most: int, width: int) -> tuple[wp.array, wp.array, wp.array]:
+    """(ids, ascending; their pixels, ascending in each; `RUN` numbers of each id up to the largest)."""
     count, device = len(ids), ids.device
     # The sort wants room for as many again; it keeps the order of what has the same id.
     id, pixel = (wp.empty(2 * count, dtype=int, device=device) for _ in range(2))
     launch.launch(numbered_kernel, count, [ids, id, pixel], device)
     wp.utils.radix_sort_pairs(id, pixel, count)
-    runs = wp.zeros((max(wanted) + 1) * RUN, dtype=int, device=device)
+    runs = wp.zeros((most + 1) * RUN, dtype=int, device=device)
     launch.launch(runs_kernel, count, [count, id, pixel, width, runs], device)
+    return id, pixel, runs
+
+
+def _unread_pixels(scene: Scene, gbuffer: GBuffer, ids: wp.array, wanted: Collection[int]) -> dict[int, MirrorPixels]:
+    """The pixels of every id where nothing is read: each alone, in as many entries as there are pixels."""
+    most, width = max(wanted), gbuffer.camera.size[0]
+    id, pixel, runs = _sorted(ids, most, width)
+
+    def own(least: int, most: int) -> wp.array:
+        numbers = wp.empty(len(ids), dtype=int, device=scene.device)
+        launch.launch(own_pixels_kernel, len(ids), [id, pixel, least, most, numbers], scene.device)
+        return numbers
+
+    whole = _met(scene, gbuffer, own(1, most), 1, "plain")
+    found = {}
+    for k in wanted:
+        numbers = whole.pixel if len(wanted) == 1 else own(k, k)
+        found[k] = replace(whole, reflector=k, pixel=numbers, run=compact.run(runs, k * RUN, (k + 1) * RUN))
+    return found
+
+
+def told(pixels: MirrorPixels, width: int) -> tuple[slice, MirrorPixels]:
+    """Where among their entries pixels stand that were found where nothing was read, and these alone; read now."""
+    start, end, *edges = pixels.run.numpy().tolist()
+    arrays = (compact.run(array, start, end) for array in (pixels.pixel, pixels.point, pixels.normal, pixels.direction))
+    return slice(start, end), MirrorPixels(pixels.reflector, *arrays, _box(width, *edges))
+
+
+def _box(width: int, top: int, bottom: int, before: int, right: int) -> Box:
+    """Bounds by the last numbers of a run."""
+    return width - before, top, right, bottom + 1
+
+
+def _sorted_by_id(ids: wp.array, wanted: Collection[int], width: int) -> tuple[wp.array, dict[int, Run]]:
+    """The pixels of every id, as `_pixels_by_id` finds them, with nothing read but `RUN` numbers an id."""
+    _, pixel, runs = _sorted(ids, max(wanted), width)
     read = runs.numpy().reshape(-1, RUN).tolist()
     # Those of no id lie before the others.
     begin = min((start for start, end, *_ in read if end > start), default=0)
     last = max(end for _, end, *_ in read)
     found = {}
-    for k, (start, end, top, bottom, before, right) in enumerate(read):
+    for k, (start, end, *edges) in enumerate(read):
         if k in wanted and end > start:
-            found[k] = start - begin, end - begin, (width - before, top, right, bottom + 1)
+            found[k] = start - begin, end - begin, _box(width, *edges)
         elif k in wanted:
             found[k] = 0, 0, (0, 0, 0, 0)
     return compact.run(pixel, begin, last), found

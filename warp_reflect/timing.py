@@ -9,7 +9,7 @@ from time import perf_counter
 import warp as wp
 
 from warp_reflect.counts import Statistics, add_statistics
-from warp_reflect.launch import loading_ms
+from warp_reflect.launch import loading_ms, reads
 
 _clocks: list[Callable[[], float]] = [perf_counter]
 
@@ -80,7 +80,7 @@ class StageTimer:
 
     def _mark(self) -> wp.Event | None:
         """A mark in what a CUDA device has to do."""
-        if not self._device.is_cuda:
+        if not self._device.is_cuda or not reads():
             return None
         mark = wp.Event(self._device, enable_timing=True)
         wp.record_event(mark)

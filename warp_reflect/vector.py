@@ -14,7 +14,7 @@ from functools import cache
 
 import warp as wp
 
-from warp_reflect.launch import launch
+from warp_reflect.launch import launch, reads
 
 wp.set_module_options({"enable_backward": False})
 
@@ -578,12 +578,12 @@ def chosen(kernels: str, device) -> bool:
 
     Args:
         kernels: `Settings.kernels`.
-        device: Warp device; CUDA has the plain kernels.
+        device: Warp device; CUDA has the plain kernels, and so has what goes its way (`launch.unread`).
 
     Raises:
         RuntimeError: `vector` was asked for and this CPU's compiler has none.
     """
-    if kernels == "plain" or wp.get_device(device).is_cuda:
+    if kernels == "plain" or not reads() or wp.get_device(device).is_cuda:
         return False
     if kernels == "vector" and missing():
         raise RuntimeError(f"kernels=vector: {missing()}; use kernels=auto")

@@ -1,0 +1,162 @@
+"""Frames that repeat the launches of one: the same bits as frames that are launched anew, and a reason where there are none."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rooms import placed, plane_room, room, sphere
+
+import warp_reflect as wr
+from warp_reflect import captured, launch
+from warp_reflect.channels import CHANNELS
+
+ROOT = Path(__file__).parent.parent
+SIZE = 96, 54
+pytestmark = pytest.mark.skipif(not captured.RECORDS_CPU, reason="this Warp writes launches down on CUDA alone")
+
+
+def planned(scene, method="reference", **settings):
+    settings = {"bounces": 1, "kernels": "plain", "keep_static": False} | settings
+    return wr.make_plan(scene, size=SIZE, settings=wr.Settings(**settings), method=method)
+
+
+def walk(camera, reach):
+    """The camera, steps aside, from nearer (the mirror grows), turned round (it is gone), and where it began."""
+    aside = [dataclasses.replace(camera, eye=camera.eye + k * 0.1 * reach * camera.right) for k in (1, 2)]
+    near = dataclasses.replace(camera, eye=camera.eye + 0.4 * reach * camera.forward, fx=0.8 * camera.fx)
+    turned = dataclasses.replace(camera, right=-camera.right, forward=-camera.forward)
+    return [camera, *aside, near, turned, camera]
+
+
+def scenes():
+    stages = {
+        name: lambda name=name: wr.load_stage(ROOT / "usd_scenes" / f"{name}.usda")
+        for name in ("one_mirror", "kitchen")
+    }
+    return stages | {"ball": lambda: room(sphere(), placed(0, 0, -1)), "plane": plane_room}
+
+
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [
+        ("ball", {}),
+        ("ball", {"shadows": "on"}),
+        ("plane", {}),
+        ("one_mirror", {"shadows": "on"}),
+        ("one_mirror", {"shadows": "off"}),
+        ("kitchen", {"shadows": "on"}),
+    ],
+)
+def test_a_repeated_frame_is_the_launched_one_bit_for_bit(name, settings):
+    scene = scenes()[name]()
+    plan = planned(scene, **settings)
+    repeated, before, last, counts = wr.capture_frame(scene, plan), None, None, []
+    for view in walk(plan.camera, np.linalg.norm(plan.camera.eye - scene.origin)):
+        with launch.as_device():
+            before = wr.render_frame(scene, plan, view, before)
+        last = repeated.render(view, last)
+        for channel in CHANNELS:
+            np.testing.assert_array_equal(last[channel], before[channel], err_msg=channel)
+        assert {id: (layer.pixels.count, layer.pixels.box) for id, layer in last.layers.items()} == {
+            id: (layer.pixels.count, layer.pixels.box) for id, layer in before.layers.items()
+        }
+        assert last.statistics == before.statistics
+        counts.append(sum(layer.pixels.count for layer in last.layers.values()))
+    assert counts[0] == counts[-1] > 0 == counts[4] and len(set(counts)) >= 4
+
+
+def test_orthographic_cameras_are_repeated_too():
+    scene = room(sphere(), placed(0, 0, -1))
+    camera = dataclasses.replace(scene.data.cameras[0], projection="orthographic", horizontal_aperture=40.0)
+    scene.data.cameras[0] = camera
+    plan = planned(scene)
+    repeated = wr.capture_frame(scene, plan)
+    for shift in (0.0, 0.3):
+        view = dataclasses.replace(plan.camera, eye=plan.camera.eye + shift * plan.camera.right)
+        with launch.as_device():
+            np.testing.assert_array_equal(repeated.render(view)["RGBA"], wr.render_frame(scene, plan, view)["RGBA"])
+
+
+def test_a_repeated_frame_copies_its_camera_alone(monkeypatch):
+    """What is recorded copies nothing: on CUDA a copy from the host would be repeated from memory that is another's by then."""
+    monkeypatch.setattr(sys, "path", [str(ROOT / "tools"), *sys.path])
+    import host_copies
+
+    scene = room(sphere(), placed(0, 0, -1))
+    plan = planned(scene, shadows="on")
+    wr.capture_frame(scene, plan)
+    with host_copies.counted() as copies:
+        repeated = wr.capture_frame(scene, plan)
+        repeated.render()
+        frame = repeated.render()
+    assert [copy.kind for copy in copies] == ["write"] * 3
+    with host_copies.counted() as copies:
+        frame["RGBA"]
+    assert [copy.kind for copy in copies] == ["read"]
+
+
+def test_ordinary_frames_are_what_they_were():
+    scene = room(sphere(), placed(0, 0, -1))
+    plan = planned(scene, kernels="auto", shadows="on")
+    before = wr.render_frame(scene, plan)
+    repeated = wr.capture_frame(scene, plan)
+    moved = dataclasses.replace(plan.camera, eye=plan.camera.eye + 0.2)
+    with launch.recorded() as first:
+        other = wr.render_frame(scene, plan, moved)
+    repeated.render()
+    with launch.recorded() as second:
+        after = wr.render_frame(scene, plan)
+    assert [name for name, _ in first] == [name for name, _ in second]
+    np.testing.assert_array_equal(after["RGBA"], before["RGBA"])
+    assert not np.array_equal(other["RGBA"], before["RGBA"])
+
+
+def test_nothing_is_told_of_a_frame_that_was_drawn_over():
+    scene = room(sphere(), placed(0, 0, -1))
+    repeated = wr.capture_frame(scene, planned(scene))
+    first = repeated.render()
+    kept = first["RGBA"].copy()
+    second = repeated.render()
+    with pytest.raises(RuntimeError, match=r"'N': .*drawn over"):
+        first["N"]
+    with pytest.raises(RuntimeError, match="drawn over"):
+        first.layers.keys() | set()
+    np.testing.assert_array_equal(second["RGBA"], kept)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"near": 0.2}, "near: got 0.2"),
+        ({"far": 50.0}, "far: got 50"),
+        ({"orthographic": True}, "orthographic: got True"),
+    ],
+)
+def test_cameras_that_see_otherwise_are_refused(change, told):
+    scene = room(sphere(), placed(0, 0, -1))
+    plan = planned(scene)
+    with pytest.raises(ValueError, match=told):
+        wr.capture_frame(scene, plan).render(dataclasses.replace(plan.camera, **change))
+
+
+@pytest.mark.parametrize(
+    ("stage", "method", "settings", "told"),
+    [
+        ("one_mirror", "reflector_map", {}, "solved by reflector_map"),
+        ("one_mirror", "environment", {}, "solved by environment"),
+        ("kitchen", "reference", {"bounces": 2}, "second_bounce"),
+        ("frosted_window", "reference", {}, "seen through"),
+        ("cut_outs", "reference", {}, "holes"),
+        ("polished_spheres", "reference", {}, "roughness"),
+    ],
+)
+def test_plans_that_decide_between_launches_say_so(stage, method, settings, told):
+    scene = wr.load_stage(ROOT / "usd_scenes" / f"{stage}.usda")
+    plan = planned(scene, method, **settings)
+    assert told in captured.why_not(scene, plan)
+    with pytest.raises(ValueError, match=f"{told}.*render_frame"):
+        wr.capture_frame(scene, plan)
