@@ -19,7 +19,7 @@ from warp_reflect.scene import CameraData, InstanceData, MaterialData, MeshData,
 from warp_reflect.settings import Status
 from warp_reflect.solver import solve
 from warp_reflect.stage import gprims
-from warp_reflect.techniques import quadric, quadric_branches, quadric_patch
+from warp_reflect.techniques import quadric, quadric_branches, quadric_patch, quadric_sheets
 from warp_reflect.techniques.vertices import empty_vertices, solve_frame
 
 FOLDER = Path(__file__).resolve().parents[1] / "usd_scenes"
@@ -341,6 +341,47 @@ def test_mesh_with_rims_is_recognised_sheet_by_sheet():
     # A capsule is smooth all over and no quadric.
     row = render(room(plain_mesh(gprims.capsule(0.5, 0.5, 0.8, "Y"))), "quadric").plan.rows[0]
     assert row.technique == "raytraced" and "not recognised" in row.reason
+
+
+@pytest.mark.parametrize("is_mirrored", [False, True])
+def test_what_moves_is_recognised_once_and_as_what_it_is_where_it_stands(is_mirrored, monkeypatch):
+    """A cylinder with rims, turned, shifted and three times as large: as one of the same place that does not move."""
+    turned = oracles.random_pose(np.random.default_rng(3), 3.0)
+    if (np.linalg.det(turned) < 0.0) != is_mirrored:
+        turned[:, 0] *= -1.0
+    data = room(plain_mesh(gprims.cylinder(0.7, 0.4, 1.2, "X"))).source_data
+    asked = []
+    fitted = quadric_sheets.fit_quadric
+    monkeypatch.setattr(quadric_sheets, "fit_quadric", lambda *given: asked.append(1) or fitted(*given))
+
+    def at(place: np.ndarray, moves: bool, earlier: Scene | None = None) -> Scene:
+        mirror = dataclasses.replace(data.instances[0], world_from_object=place, moves=moves)
+        return Scene(dataclasses.replace(data, instances=[mirror, *data.instances[1:]]), earlier=earlier)
+
+    still, before = at(turned, False), at(translation(0.2, 0.1, 0.0) @ turned, True)
+    expected, _ = quadric_sheets.sheets_of(still, 0), quadric_sheets.sheets_of(before, 0)
+    asked.clear()
+    moved = at(turned, True, before)
+    found = quadric_sheets.sheets_of(moved, 0)
+    assert bool(asked) == is_mirrored
+    assert [sheet.name for sheet in found] == [sheet.name for sheet in expected] and len(found) == 3
+    for ours, theirs in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(ours.triangles, theirs.triangles)
+        assert ours.known and ours.distance == pytest.approx(theirs.distance, abs=1e-5)
+        assert ours.sine == pytest.approx(theirs.sine, abs=1e-3)
+        here, there = (
+            each.host_points[each.host_triangles[ours.triangles]].reshape(-1, 3).astype(np.float64)
+            for each in (moved, still)
+        )
+        if ours.plane is None:
+            assert ours.quadric.kind == theirs.quadric.kind and np.linalg.det(ours.quadric.axes) == pytest.approx(1.0)
+            assert max(ours.quadric.distances(here).max(), theirs.quadric.distances(there).max()) < 1e-5
+            continue
+        for sheet, points, scene in ((ours, here, moved), (theirs, there, still)):
+            in_plane = np.append(points, np.ones((len(points), 1)), axis=1) @ sheet.plane.T
+            assert np.abs(in_plane[:, 2]).max() < 1e-5 and np.abs(in_plane).max() < 2.0
+            a, b, c = scene.host_points[scene.host_triangles[sheet.triangles[0]]]
+            assert sheet.plane[2, :3] @ np.cross(b - a, c - a) > 0.0
 
 
 def bowl() -> MeshData:

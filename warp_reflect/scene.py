@@ -315,6 +315,26 @@ class PartRange:
     is_whole: bool  # no other part shares the vertices
 
 
+@dataclass(frozen=True)
+class AtRest:
+    """A part of what moves, in the frame of its mesh.
+
+    Attributes:
+        key: (mesh, which of its parts).
+        mesh, own: Those.
+        scene_from_object: Where it stands: a similarity, float64 [4, 4].
+    """
+
+    key: tuple[int, int]
+    mesh: MeshData
+    own: Part
+    scene_from_object: np.ndarray
+
+    @property
+    def is_mirrored(self) -> bool:
+        return bool(np.linalg.det(self.scene_from_object[:3, :3]) < 0.0)
+
+
 class Scene:
     """A `SceneData` on a device.
 
@@ -340,7 +360,8 @@ class Scene:
         self.notes = list(data.notes)
         self._reload = reload
         self.bodies: dict[int, Body] = {}
-        self.bodies_in_place: dict = {}  # (mesh, which of its parts) of what moves -> its body, in the frame of the mesh
+        # (mesh, which of its parts, what) -> what was found out about the shape of what moves, in the frame of the mesh.
+        self.facts_at_rest: dict = {}
         self.part_tracers: dict = {}
         self.mirror_tracers: dict = {}  # material -> the structure over what a mirror of it may show
         self.seen: dict[int, np.ndarray] = {}  # material -> which triangles a mirror of it may show
@@ -618,7 +639,7 @@ class Scene:
         """The triangles of a part classified as a solid, scene frame."""
         if part not in self.bodies:
             piece = self.parts[part]
-            body = self._moving_body(part) if part in self.moving_parts else None
+            body = self._moving_body(part)
             if body is None:
                 first = piece.first_vertex
                 faces = self.host_triangles[piece.first_triangle : piece.first_triangle + piece.triangle_count]
@@ -629,21 +650,39 @@ class Scene:
         return self.bodies[part]
 
     def _moving_body(self, part: int) -> Body | None:
-        """The body of what moves: its mesh's, placed; None where it is placed by more than a similarity."""
+        """The body of what moves: its mesh's, placed; None as for `at_rest`."""
+        rest = self.at_rest(part)
+        if rest is None:
+            return None
+
+        def make() -> Body:
+            first, count = rest.own.first_triangle, rest.own.triangle_count
+            return analyse(rest.mesh.points, rest.mesh.triangles[first : first + count])
+
+        return self.kept_at_rest(rest, "body", make).placed(rest.scene_from_object)
+
+    def at_rest(self, part: int) -> AtRest | None:
+        """A part in the frame of its mesh; None where it does not move, or is placed by more than a similarity."""
         prim = self.parts[part].prim
         instance = self.data.instances[prim - 1]
-        mesh, scene_from_object = self.data.meshes[instance.mesh], self.scene_from_object(instance)
+        if not instance.moves:
+            return None
+        scene_from_object = self.scene_from_object(instance)
         if not is_similarity(scene_from_object):
             return None
         first = part
         while first and self.parts[first - 1].prim == prim:
             first -= 1
-        key = instance.mesh, part - first
-        if key not in self.bodies_in_place:
-            own = (mesh.parts or [Part(0, len(mesh.triangles))])[key[1]]
-            faces = mesh.triangles[own.first_triangle : own.first_triangle + own.triangle_count]
-            self.bodies_in_place[key] = analyse(mesh.points, faces)
-        return self.bodies_in_place[key].placed(scene_from_object)
+        mesh = self.data.meshes[instance.mesh]
+        own = (mesh.parts or [Part(0, len(mesh.triangles))])[part - first]
+        return AtRest((instance.mesh, part - first), mesh, own, scene_from_object)
+
+    def kept_at_rest(self, rest: AtRest, what: str, make: Callable):
+        """What `make()` gives of a part in the frame of its mesh, kept wherever that stands."""
+        key = *rest.key, what
+        if key not in self.facts_at_rest:
+            self.facts_at_rest[key] = make()
+        return self.facts_at_rest[key]
 
     def scene_from_object(self, instance: InstanceData) -> np.ndarray:
         """float64 [4, 4] of an instance."""

@@ -271,7 +271,7 @@ def _take_over(scene: Scene, earlier: Scene, moved: _Moved, placed: np.ndarray) 
         if name in known and not (bent and name in OF_SHAPE):
             vars(scene)[name] = known[name]
     scene.bodies = {k: body for k, body in earlier.bodies.items() if k not in gone}
-    scene.bodies_in_place = {key: body for key, body in earlier.bodies_in_place.items() if key[0] not in bent}
+    scene.facts_at_rest = {key: fact for key, fact in earlier.facts_at_rest.items() if key[0] not in bent}
     scene.pyramids, scene.lasting = earlier.pyramids, earlier.lasting
     scene.seen = dict(earlier.seen)
     scene.fits = {k: fit for k, fit in earlier.fits.items() if k not in gone}

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from warp_reflect.bodies import Sheet, fit_sheet, overhang, weld
-from warp_reflect.scene import PartRange, Scene
+from warp_reflect.scene import AtRest, PartRange, Scene
 from warp_reflect.topology import edge_neighbours
 
 EDGE_SINE_MAX = 0.3  # 17 degrees; facets of a coarse but smooth body stay below, the rim of a cylinder is far above
@@ -89,19 +89,32 @@ class Segmentation:
         return text
 
 
-def part_mesh(scene: Scene, part: PartRange) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """(points, triangles, corner normals or None) of a part, scene frame; flat facets get no normals."""
+def part_mesh(scene: Scene, part: PartRange) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(points, triangles, corner normals) of a part, scene frame; flat facets get their own."""
     triangles = slice(part.first_triangle, part.first_triangle + part.triangle_count)
     points = scene.host_points[part.first_vertex : part.first_vertex + part.vertex_count]
     faces = scene.host_triangles[triangles] - part.first_vertex
-    index = scene.host_normal_index[triangles]
+    return points, faces, _corner_normals(points, faces, scene.host_normal_index[triangles], scene.host_normals)
+
+
+def mesh_at_rest(rest: AtRest) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The same of a part that moves, in the frame of its mesh."""
+    mesh, triangles = rest.mesh, slice(rest.own.first_triangle, rest.own.first_triangle + rest.own.triangle_count)
+    faces = mesh.triangles[triangles]
+    if mesh.normals is None:
+        return mesh.points, faces, _corner_normals(mesh.points, faces, np.full_like(faces, -1), mesh.points)
+    index = faces if mesh.normal_index is None else mesh.normal_index[triangles]
+    return mesh.points, faces, _corner_normals(mesh.points, faces, index, mesh.normals)
+
+
+def _corner_normals(points: np.ndarray, faces: np.ndarray, index: np.ndarray, normals: np.ndarray) -> np.ndarray:
     corner = points[faces].astype(np.float64)
     facet = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     facet /= np.maximum(np.linalg.norm(facet, axis=1, keepdims=True), 1.0e-300)
-    normals = np.repeat(facet[:, None], 3, axis=1)
+    found = np.repeat(facet[:, None], 3, axis=1)
     smooth = index[:, 0] >= 0
-    normals[smooth] = scene.host_normals[index[smooth]]
-    return points, faces, normals
+    found[smooth] = normals[index[smooth]]
+    return found
 
 
 def segment(points: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> Segmentation:

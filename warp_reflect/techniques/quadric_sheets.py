@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from warp_reflect.bodies import weld
 from warp_reflect.mirrors import QuadricMirror
-from warp_reflect.quadric_fit import fit_quadric
+from warp_reflect.quadric_fit import Fit, fit_quadric
 from warp_reflect.quadrics import CanonicalQuadric, QuadricKind
 from warp_reflect.scene import PartRange, Scene, Shape
-from warp_reflect.segments import components, part_mesh
+from warp_reflect.segments import components, mesh_at_rest, part_mesh
 from warp_reflect.techniques import planar
 
 CREASE_COS = 0.955  # 17 degrees between two facets' normals at a corner they share: beyond, they belong to two sheets
@@ -43,14 +43,39 @@ class Sheet:
         """Whether it has a surface."""
         return self.quadric is not None or self.plane is not None
 
+    def placed(self, scene_from_object: np.ndarray, first_triangle: int) -> Sheet:
+        """The same sheet of a mesh placed by a similarity that does not mirror, float64 [4, 4]."""
+        scale = float(np.cbrt(np.linalg.det(scene_from_object[:3, :3])))
+        quadric, plane, name = self.quadric, self.plane, self.name
+        if quadric is not None:
+            quadric = replace(
+                quadric,
+                origin=scene_from_object[:3, :3] @ quadric.origin + scene_from_object[:3, 3],
+                axes=scene_from_object[:3, :3] @ quadric.axes / scale,
+                size=quadric.size * scale,
+            )
+            name = str(Fit(quadric, self.distance, self.sine))
+        if plane is not None:
+            plane = plane @ np.linalg.inv(scene_from_object)
+        return Sheet(self.triangles + first_triangle, quadric, plane, scale * self.distance, self.sine, name)
+
 
 def sheets_of(scene: Scene, part_index: int) -> list[Sheet]:
-    """The sheets of a part, one without a surface last if there is any; kept with the scene."""
+    """The sheets of a part, one without a surface last if there is any; kept with the scene.
+
+    Those of a mesh that moves are recognised once, wherever it stands.
+    """
     if part_index not in scene.fits:
         part = scene.parts[part_index]
         shapes = [scene.patch_shapes[k] for k in part.patches]
-        analytic = all(shape is not None for shape in shapes)
-        scene.fits[part_index] = _analytic(scene, part) if analytic else _recognised(scene, part)
+        if all(shape is not None for shape in shapes):
+            found = _analytic(scene, part)
+        elif (rest := scene.at_rest(part_index)) is None or rest.is_mirrored:
+            found = _recognised(*part_mesh(scene, part), part.first_triangle)
+        else:
+            known = scene.kept_at_rest(rest, "sheets", lambda: _recognised(*mesh_at_rest(rest), 0))
+            found = [sheet.placed(rest.scene_from_object, part.first_triangle) for sheet in known]
+        scene.fits[part_index] = found
     return scene.fits[part_index]
 
 
@@ -77,16 +102,16 @@ def _analytic(scene: Scene, part: PartRange) -> list[Sheet]:
     return found
 
 
-def _recognised(scene: Scene, part: PartRange) -> list[Sheet]:
-    points, faces, normals = part_mesh(scene, part)
+def _recognised(points: np.ndarray, faces: np.ndarray, normals: np.ndarray, first_triangle: int) -> list[Sheet]:
+    """The sheets of a mesh, in its own frame; arguments as from `part_mesh`."""
     sheet = _smooth_sheets(points, faces, normals)
     if sheet.max(initial=0) >= SHEETS_MAX:
-        own = part.first_triangle + np.arange(part.triangle_count)
+        own = first_triangle + np.arange(len(faces))
         return [Sheet(own, None, None, np.inf, 1.0, f"{sheet.max() + 1} smooth sheets, at most {SHEETS_MAX}")]
     found = []
     for number in range(int(sheet.max(initial=-1)) + 1):
         members = np.flatnonzero(sheet == number)
-        own = members + part.first_triangle
+        own = members + first_triangle
         corner, normal = points[faces[members]].astype(np.float64), normals[members].astype(np.float64)
         flat = _flat(corner, normal)
         if flat is not None:

@@ -23,7 +23,7 @@ from warp_reflect.launch import few_registers, launch, module_part
 from warp_reflect.layers import Camera, CameraView, GBuffer, MirrorPixels, ReflectionLayer, Reflector
 from warp_reflect.reflector_maps import ReflectorMap, ReflectorMapView
 from warp_reflect.scene import PartRange, Scene
-from warp_reflect.segments import EDGE_SINE_MAX, Segmentation, part_mesh, segment
+from warp_reflect.segments import EDGE_SINE_MAX, Segmentation, mesh_at_rest, part_mesh, segment
 from warp_reflect.settings import Settings, Technique
 from warp_reflect.techniques import baking, forward, map_vector, pieces, planar, sheet_branches
 from warp_reflect.techniques.map_search import (
@@ -218,9 +218,17 @@ def _one_map(scene: Scene, part: int) -> bool:
     key = "one map", scene.parts[part].first_triangle
     known = scene.facts.get(key)
     if known is None:
-        known = scene.body(part).convex and _sharpest(*part_mesh(scene, scene.parts[part])) <= EDGE_SINE_MAX
+        known = scene.body(part).convex and _sharpest_of(scene, part) <= EDGE_SINE_MAX
         scene.facts[key] = known
     return known
+
+
+def _sharpest_of(scene: Scene, part: int) -> float:
+    """`_sharpest` of a part; of one that moves wherever it stands."""
+    rest = scene.at_rest(part)
+    if rest is None:
+        return _sharpest(*part_mesh(scene, scene.parts[part]))
+    return scene.kept_at_rest(rest, "sharpest", lambda: _sharpest(*mesh_at_rest(rest)))
 
 
 def _sharpest(points: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> float:
