@@ -13,7 +13,7 @@ from warp_reflect.reflector_maps import ReflectorMapView
 from warp_reflect.techniques.interpolation import CONVERGED, HIDDEN, RESIDUAL_MAX, ChunkView
 from warp_reflect.techniques.lanes import REFLECTOR_MAP, VIRTUAL_VERTEX
 from warp_reflect.techniques.map_search import ACCEPTED, CONVEX_SHARE, DET_MIN, NORMAL_PART_MIN, SPD_SHARE, STEP_CAP
-from warp_reflect.techniques.vertices import ESTIMATE, SolveFrame, VertexView
+from warp_reflect.techniques.vertices import ESTIMATE, SQUARED_MAX, SQUARED_MIN, SolveFrame, VertexView
 
 wp.set_module_options({"enable_backward": False})
 
@@ -106,6 +106,8 @@ def step_chunk(
     step_cap: float,
     accepted: float,
     estimate: float,
+    squared_min: float,
+    squared_max: float,
     converged: int,
     hidden: int,
     out_vertex: VertexView,
@@ -146,6 +148,8 @@ def direction_lanes_kernel(
         STEP_CAP,
         ACCEPTED,
         ESTIMATE,
+        SQUARED_MIN,
+        SQUARED_MAX,
         CONVERGED,
         HIDDEN,
         out_vertex,

@@ -47,23 +47,31 @@ VIRTUAL_VERTEX = r"""
     auto edge_reach = [&](V p, V n, V target, F curvature) -> F {
         const V to_eye = sub(eye, p);
         const F d_o = length(to_eye), d_v = length(sub(target, p));
-        const F least_o = fmax(d_o, F(1.0e-20f));
-        const F per_o = 1.0f / least_o;
-        const F cosine = magnitude(dot(n, to_eye)) / least_o;
+        const F per_o = 1.0f / fmax(d_o, F(1.0e-20f));
+        const F cosine = magnitude(dot(n, to_eye)) * per_o;
         const F least = cosine * cosine * (per_o + 1.0f / fmax(d_v, F(1.0e-20f))) + 2.0f * cosine * curvature;
         return d_v * root(estimate * d_o * least);
     };
     // vertices.virtual_vertex
     auto virtual_vertex = [&](V p, V n, V target) -> V {
         const V to_eye = sub(eye, p), to_target = sub(target, p);
-        const F curvature = 1.0f / fmax(length(p), F(1.0e-6f));
-        const F a_length = safe_length(to_eye), b_length = safe_length(to_target);
+        const F a = length(to_eye), b = length(to_target), radius = fmax(length(p), F(1.0e-6f));
         const F c_a = magnitude(dot(to_eye, n));
         const F behind = dot(to_target, n);
-        const I flat = (c_a + c_a) * curvature * b_length < a_length + b_length;
-        V q = sub(target, times(behind + behind, n));
-        if (bits(~flat)) q = vpick(flat, q, add(p, times(b_length, safe_normalize(sub(p, eye)))));
-        return matrix(frame.eye_from_unit, sub(q, eye));
+        const I flat = (c_a + c_a) * b < (a + b) * radius;
+        V q = sub(sub(target, times(behind + behind, n)), eye);
+        // The reciprocal is edge_reach's.
+        if (bits(~flat)) q = vpick(flat, q, times(1.0f + b * (1.0f / fmax(a, F(1.0e-20f))), sub(same(0.0f), to_eye)));
+        const I squared = (fmin(a, b) > squared_min) & (fmax(a, b) < squared_max);
+        if (bits(~squared)) {
+            // optics.virtual_point
+            const F a_length = safe_length(to_eye), b_length = safe_length(to_target);
+            const I as_plane = (c_a + c_a) * (1.0f / radius) * b_length < a_length + b_length;
+            const V other = vpick(as_plane, sub(target, times(behind + behind, n)),
+                add(p, times(b_length, safe_normalize(sub(p, eye)))));
+            q = vpick(squared, q, sub(other, eye));
+        }
+        return matrix(frame.eye_from_unit, q);
     };
     // layers.project, and the answer of one lane
     typedef unsigned char Bytes __attribute__((ext_vector_type(LANES)));

@@ -36,7 +36,7 @@ from warp_reflect.techniques.map_search import (
     UNREFLECTED,
     SearchSettings,
 )
-from warp_reflect.techniques.vertices import ESTIMATE, SolveFrame, VertexView
+from warp_reflect.techniques.vertices import ESTIMATE, SQUARED_MAX, SQUARED_MIN, SolveFrame, VertexView
 
 wp.set_module_options({"enable_backward": False})
 
@@ -415,6 +415,8 @@ def search_block(
     twist_max: float,
     accepted: float,
     estimate: float,
+    squared_min: float,
+    squared_max: float,
     grazing_cos: float,
     converged: int,
     hidden: int,
@@ -465,6 +467,8 @@ def search_blocks_kernel(
         TWIST_MAX,
         ACCEPTED,
         ESTIMATE,
+        SQUARED_MIN,
+        SQUARED_MAX,
         GRAZING_COS,
         CONVERGED,
         HIDDEN,

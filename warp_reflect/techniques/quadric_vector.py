@@ -24,7 +24,7 @@ from warp_reflect.techniques.quadric_search import (
     TOUCHING,
     QuadricView,
 )
-from warp_reflect.techniques.vertices import ESTIMATE, SolveFrame, VertexView
+from warp_reflect.techniques.vertices import ESTIMATE, SQUARED_MAX, SQUARED_MIN, SolveFrame, VertexView
 
 wp.set_module_options({"enable_backward": False})
 
@@ -221,6 +221,8 @@ def search_block(
     min_half_normal: float,
     min_det_share: float,
     estimate: float,
+    squared_min: float,
+    squared_max: float,
     converged: int,
     hidden: int,
     out_vertex: VertexView,
@@ -263,6 +265,8 @@ def search_blocks_kernel(
         MIN_HALF_NORMAL,
         MIN_DET_SHARE,
         ESTIMATE,
+        SQUARED_MIN,
+        SQUARED_MAX,
         CONVERGED,
         HIDDEN,
         out_vertex,

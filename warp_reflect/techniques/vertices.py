@@ -8,13 +8,15 @@ import warp as wp
 from warp_reflect import raster
 from warp_reflect.launch import stays
 from warp_reflect.layers import Camera
-from warp_reflect.optics import virtual_point
+from warp_reflect.optics import mirror_point, virtual_point
 from warp_reflect.scene import Scene
 
 wp.set_module_options({"enable_backward": False})
 
 # The deviation of an edge's picture is (h^2 / 8) 1.5 / (...), see `edge_reach`; 1.5 covers what was measured.
 ESTIMATE = wp.constant(8.0 / 1.5)
+# Lengths whose squares float32 holds with all digits.
+SQUARED_MIN, SQUARED_MAX = wp.constant(1.0e-12), wp.constant(1.0e12)
 
 
 @wp.struct
@@ -45,10 +47,20 @@ class VertexView:
 
 @wp.func
 def virtual_vertex(frame: SolveFrame, p: wp.vec3, n: wp.vec3, target: wp.vec3) -> wp.vec3:
-    """Virtual vertex of a reflection point (unit frame), in the eye frame."""
+    """Virtual vertex of a reflection point (unit frame), in the eye frame: `optics.virtual_point`."""
+    to_eye = frame.eye - p
+    to_target = target - p
+    a = wp.length(to_eye)
+    b = wp.length(to_target)
     # Curvature of a body of the map's size: it only picks the form that forgives an error of p more.
-    curvature = 1.0 / wp.max(wp.length(p), 1.0e-6)
-    return frame.eye_from_unit * (virtual_point(p, n, frame.eye, target, curvature) - frame.eye)
+    radius = wp.max(wp.length(p), 1.0e-6)
+    if wp.min(a, b) > SQUARED_MIN and wp.max(a, b) < SQUARED_MAX:
+        c_a = wp.abs(wp.dot(to_eye, n))
+        if (c_a + c_a) * b < (a + b) * radius:
+            return frame.eye_from_unit * (mirror_point(target, p, n) - frame.eye)
+        # On the line of sight, seen from the eye.
+        return frame.eye_from_unit * ((1.0 + b * (1.0 / a)) * -to_eye)
+    return frame.eye_from_unit * (virtual_point(p, n, frame.eye, target, 1.0 / radius) - frame.eye)
 
 
 @wp.func
@@ -61,8 +73,9 @@ def edge_reach(frame: SolveFrame, p: wp.vec3, n: wp.vec3, target: wp.vec3, curva
     to_eye = frame.eye - p
     d_o = wp.length(to_eye)
     d_v = wp.length(target - p)
-    c = wp.abs(wp.dot(n, to_eye)) / wp.max(d_o, 1.0e-20)
-    least = c * c * (1.0 / wp.max(d_o, 1.0e-20) + 1.0 / wp.max(d_v, 1.0e-20)) + 2.0 * c * curvature
+    per_o = 1.0 / wp.max(d_o, 1.0e-20)
+    c = wp.abs(wp.dot(n, to_eye)) * per_o
+    least = c * c * (per_o + 1.0 / wp.max(d_v, 1.0e-20)) + 2.0 * c * curvature
     return d_v * wp.sqrt(ESTIMATE * d_o * least)
 
 
