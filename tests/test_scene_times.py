@@ -79,7 +79,7 @@ def Xform "World"
             def Cube "Box"
             {
                 double size = 0.4
-                double3 xformOp:translate = (0, 0.3, 0)
+                double3 xformOp:translate.timeSamples = { 3: (0, 0.3, 0) }
                 uniform token[] xformOpOrder = ["xformOp:translate"]
             }
             def Cube "Post"

@@ -12,7 +12,22 @@ from warp_reflect.stage.assemble import Smooth, suspect_worlds
 from warp_reflect.stage.cameras import read_camera
 from warp_reflect.stage.detail import pixels_across, subdivision_level
 from warp_reflect.stage.intake import BadPrim, Intake
-from warp_reflect.stage.walk import world_of
+from warp_reflect.stage.walk import Local, local_of, world_of
+
+
+@dataclass(frozen=True)
+class _Link:
+    """A prim in or above which something moves.
+
+    Attributes:
+        prim: The prim.
+        above: The link of its parent; -1: the stage itself.
+        still: What `walk.local_of` gives at every time; None: that has to be asked.
+    """
+
+    prim: Usd.Prim
+    above: int
+    still: Local | None
 
 
 @dataclass
@@ -23,11 +38,15 @@ class Places:
         stage: Open.
         first: The reading.
         smooth: Its subdivided meshes, whose detail depends on where they are seen from.
+        links: What moves, cameras, and all above them, parents first.
+        link_of: Of each such path.
     """
 
     stage: Usd.Stage
     first: SceneData
     smooth: list[Smooth]
+    links: list[_Link]
+    link_of: dict[str, int]
 
     @classmethod
     def of(cls, stage: Usd.Stage, first: SceneData, smooth: list[Smooth]) -> Places | None:
@@ -43,14 +62,18 @@ class Places:
             return None  # the default camera, which follows the bounds
         placed = [each.prim_path for each in first.instances]
         whole = all(sum(path in each.paths for path in placed) == each.count for each in smooth)
-        return cls(stage, first, smooth) if whole else None
+        paths = [each.prim_path for each in first.instances if each.moves] + [each.path for each in first.cameras]
+        return cls(stage, first, smooth, *_links(stage, paths, varying)) if whole else None
 
     def at(self, time: float | None, intake: Intake) -> SceneData | None:
         """The stage at a time; None where it has to be read."""
-        transforms, worlds = UsdGeom.XformCache(intake.time), {}
+        transforms, worlds = UsdGeom.XformCache(intake.time), []
+        for link in self.links:
+            local = local_of(link.prim, transforms) if link.still is None else link.still
+            worlds.append(world_of(local, worlds[link.above] if link.above >= 0 else np.eye(4)))
 
         def world(path: str) -> np.ndarray:
-            return _world(self.stage.GetPrimAtPath(path), transforms, worlds)
+            return worlds[self.link_of[path]]
 
         instances: list[InstanceData] = []
         for each in self.first.instances:
@@ -101,11 +124,21 @@ def _below(path: str, roots: set[str]) -> bool:
     return False
 
 
-def _world(prim, transforms: UsdGeom.XformCache, known: dict[str, np.ndarray]) -> np.ndarray:
-    """`world_from_object` of a prim, as the walk over the stage finds it."""
-    if prim.IsPseudoRoot():
-        return np.eye(4)
-    path = str(prim.GetPath())
-    if path not in known:
-        known[path] = world_of(prim, _world(prim.GetParent(), transforms, known), transforms)[0]
-    return known[path]
+def _links(stage: Usd.Stage, paths: list[str], varying: set[str]) -> tuple[list[_Link], dict[str, int]]:
+    """(prims and all above them, parents first; the number of each path there)."""
+    links, link_of = [], {}
+    transforms = UsdGeom.XformCache(Usd.TimeCode.EarliestTime())  # the default has no value where there is one sample
+
+    def add(prim: Usd.Prim) -> int:
+        if prim.IsPseudoRoot():
+            return -1
+        path = str(prim.GetPath())
+        if path not in link_of:
+            above = add(prim.GetParent())
+            link_of[path] = len(links)
+            links.append(_Link(prim, above, None if path in varying else local_of(prim, transforms)))
+        return link_of[path]
+
+    for path in paths:
+        add(stage.GetPrimAtPath(path))
+    return links, link_of

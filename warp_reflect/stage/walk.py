@@ -25,16 +25,27 @@ def _varies(prim) -> bool:
     return any(attribute.ValueMightBeTimeVarying() for attribute in prim.GetAuthoredAttributes())
 
 
-def world_of(prim, world_from_parent: np.ndarray, transforms: UsdGeom.XformCache) -> tuple[np.ndarray, bool]:
-    """(world_from_object of a prim, float64 [4, 4]; whether it takes nothing from its parent)."""
+# A prim's own transform, float64 [4, 4], None where it has none, and whether it takes nothing from its parent.
+Local = tuple[np.ndarray | None, bool]
+
+
+def local_of(prim, transforms: UsdGeom.XformCache) -> Local:
+    """How a prim is placed in its parent."""
     if not prim.IsA(UsdGeom.Imageable):
-        return world_from_parent, False
+        return None, False
     local, resets = transforms.GetLocalTransformation(prim)
-    world = column_matrix(local)
-    if not resets:
-        with np.errstate(invalid="ignore", over="ignore"):  # told by `transform_fault` where something is drawn
-            world = world_from_parent @ world
-    return world, resets
+    return column_matrix(local), resets
+
+
+def world_of(local: Local, world_from_parent: np.ndarray) -> np.ndarray:
+    """world_from_object of a prim, float64 [4, 4]."""
+    matrix, resets = local
+    if matrix is None:
+        return world_from_parent
+    if resets:
+        return matrix
+    with np.errstate(invalid="ignore", over="ignore"):  # told by `transform_fault` where something is drawn
+        return world_from_parent @ matrix
 
 
 @dataclass(frozen=True)
@@ -136,7 +147,8 @@ class Walk:
             purpose_attribute = imageable.GetPurposeAttr()
             authored = purpose_attribute.HasAuthoredValue()
             purpose = str(purpose_attribute.Get(time)) if authored else state.purpose
-            world, resets = world_of(prim, state.world_from_parent, self.transforms)
+            local = local_of(prim, self.transforms)
+            world, resets = world_of(local, state.world_from_parent), local[1]
             if resets and state.inside_instancer:
                 self.intake.note(prim.GetPath(), "xformOpOrder: !resetXformStack! stops at the point instancer")
             moves = imageable.GetVisibilityAttr().ValueMightBeTimeVarying()
