@@ -11,6 +11,7 @@ from test_shade import WHITE, ball_mesh, distant, dome, eye_rays, ground, look_a
 
 import warp_reflect as wr
 from warp_reflect import direct, launch, pictures, raster, shadows
+from warp_reflect import frame as frame_module
 from warp_reflect.scene import InstanceData, LightData, MaterialData, Scene, SceneData, TextureRef
 
 SILVER = MaterialData(base_color=(0.9, 0.9, 0.9), metallic=1.0, roughness=0.0)
@@ -162,6 +163,19 @@ def test_ball_shows_the_same_holes_by_every_technique():
         same = frame["reflectedId"] == reference["reflectedId"]
         mirror = reference["reflectorId"] > 0
         assert same[mirror].mean() > (0.9 if settings.get("refine") == "off" else 0.999)
+
+
+def test_mirrors_that_are_traced_together_show_the_holes_that_each_shows_alone(monkeypatch):
+    balls = [(ball_mesh(), place(x, 0, -1.2, 0.8), SILVER) for x in (-0.9, 0.9)]
+    scene = scene_of([*balls, (card(), place(0, 1.1, -0.6), cut()), (square(24, 9.0), place(0, -1, 0), WHITE)])
+    camera = look_at((0.2, 1.6, 3.0), (0, 0.2, -1), fov=45.0, size=(160, 120))
+    together = rendered(scene, camera, "reference")
+    assert all(layer.whole is not None for layer in together.layers.values())
+    monkeypatch.setattr(frame_module, "_together", lambda rows, pixels: [[row] for row in rows])
+    alone = rendered(scene, camera, "reference")
+    assert (alone["reflectedId"] == 3).sum() > 200
+    for channel in ("RGBA", "reflectedPoint", "status"):
+        np.testing.assert_array_equal(together[channel], alone[channel])
 
 
 def test_a_distant_light_throws_the_shadow_of_what_is_there():

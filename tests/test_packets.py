@@ -6,10 +6,10 @@ import warp as wp
 from test_shade import WHITE, ball_mesh, distant, dome, ground, look_at, place, scene_of, turned
 
 import warp_reflect as wr
-from warp_reflect import bvh, direct, raster, shadows, surface, vector
+from warp_reflect import bounces, bvh, compact, direct, raster, shadows, surface, vector
 from warp_reflect.any_hit import ANY_HIT
 from warp_reflect.launch import FINITE_FLAGS, launch
-from warp_reflect.layers import MirrorPixels, ReflectionLayer
+from warp_reflect.layers import MirrorPixels, ReflectionLayer, Reflector
 from warp_reflect.scene import LightData, MaterialData
 from warp_reflect.settings import Status, Technique
 from warp_reflect.wide_packets import TRAVERSAL
@@ -360,6 +360,39 @@ def test_pixels_are_asked_in_tiles_each_once_as_one_by_one(asked, convex):
     for other in found[1:]:
         for got, expected in zip(other, found[0], strict=True):
             np.testing.assert_array_equal(got, expected)
+
+
+@pytest.mark.parametrize("trees", [1, 2])
+@pytest.mark.parametrize("convex", [True, False])
+def test_mirrors_are_traced_together_as_one_by_one(convex, trees, monkeypatch):
+    """One in front of the other; the last pixel of the first is beside the first of the second."""
+    scene, _ = lit_balls()
+    tracers = [bvh.Tracer(scene) for _ in range(trees)]
+    monkeypatch.setattr(scene, "mirror_tracer", lambda part: tracers[part % trees])
+    camera = look_at((1.3, 1.2, 3.0), (0.5, 0.6, 0.3), fov=50, size=(161, 90))
+    gbuffer = raster.draw_scene(scene, camera)
+    seen = surface.mirror_pixels(scene, gbuffer, {1: 1, 2: 2})[0]
+    first, second = (seen[id].pixel.numpy() for id in (1, 2))
+    (beside,) = np.flatnonzero(np.isin(first + 1, second))[:1]
+    some = [np.flatnonzero(first <= first[beside]), len(first) + np.flatnonzero(second > first[beside])]
+    arrays = (getattr(seen[1].whole, name) for name in ("pixel", "point", "normal", "direction"))
+    chosen = wp.array(np.concatenate(some).astype(np.int32), dtype=int, device=CPU)
+    whole = MirrorPixels(0, *(compact.taken(array, chosen) for array in arrays), (0, 0, *camera.size))
+    edges = 0, len(some[0]), len(chosen)
+    pixels = [whole.part(k + 1, edges[k], edges[k + 1], whole.box) for k in range(2)]
+    assert pixels[1].follows(pixels[0]) and min(each.count for each in pixels) > 300
+    bodies = bounces.Mirrors(scene, [Reflector(1, 1, convex), Reflector(2, 2, convex)]).bodies
+    names = ("triangle", "u", "v", "distance", "status")
+    for kernels, threads in (("plain", 1), ("vector", 1), ("vector", 2), ("vector", 8)):
+        together = ReflectionLayer.empty(MirrorPixels.joined(pixels), Technique.RAYTRACED, CPU)
+        parts = together.parts(pixels)
+        bvh.trace_together(scene, gbuffer, parts, [(1, convex), (2, convex)], bodies, threads, kernels)
+        for own, part in zip(pixels, parts, strict=True):
+            alone = ReflectionLayer.empty(own, Technique.RAYTRACED, CPU)
+            bvh.trace_pixels(scene, gbuffer, own, alone, own.reflector, convex, threads=threads, kernels=kernels)
+            for name in names:
+                np.testing.assert_array_equal(getattr(part, name).numpy(), getattr(alone, name).numpy(), err_msg=name)
+        assert {Status.CONVERGED, Status.SKY} <= set(together.status.numpy())
 
 
 @pytest.mark.parametrize("width", [0, 70])

@@ -6,6 +6,7 @@ What becomes of one ray is in `ray_walk.py`. Compiled finite-only, as all that r
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 
 import numpy as np
 import warp as wp
@@ -60,6 +61,35 @@ def trace_kernel(
     out_v[i] = hit.v
 
 
+@wp.func
+def body_at(
+    scene: SceneView,
+    facets: wp.array(dtype=int),
+    pixel: wp.array(dtype=int),
+    body: OwnBody,
+    bodies: wp.array(dtype=OwnBody),
+    i: int,
+) -> OwnBody:
+    """The body that a mirror pixel is on."""
+    own = body
+    if bodies.shape[0] > 0:
+        own = bodies[scene.triangle_patch[facets[pixel[i]]]]
+    return own
+
+
+@wp.func
+def is_on(
+    scene: SceneView,
+    facets: wp.array(dtype=int),
+    pixel: wp.array(dtype=int),
+    body: OwnBody,
+    bodies: wp.array(dtype=OwnBody),
+    i: int,
+) -> bool:
+    """Whether a mirror pixel is on a body too."""
+    return body_at(scene, facets, pixel, body, bodies, i).first_triangle == body.first_triangle
+
+
 @wp.kernel
 def trace_pixels_kernel(
     first: int,
@@ -72,6 +102,7 @@ def trace_pixels_kernel(
     normal: wp.array(dtype=wp.vec3),
     direction: wp.array(dtype=wp.vec3),
     body: OwnBody,
+    bodies: wp.array(dtype=OwnBody),
     index: wp.array(dtype=int),
     indexed: int,
     known: int,
@@ -85,8 +116,9 @@ def trace_pixels_kernel(
 ):
     """One thread per asked mirror pixel; nothing is met where its number is -1.
 
-    `known` is 1 for what `bvh_vector.first_met` has left. With a `status` a miss beside a hit, or without a neighbour, is asked
-    again: a kernel of its own would be compiled for as long as this one.
+    `bodies` are those of patches; of length 0: `body` is all pixels' own. `known` is 1 for what `bvh_vector.first_met` has left.
+    With a `status` a miss beside a hit, or without a neighbour, is asked again: a kernel of its own would be compiled for as long
+    as this one.
     """
     i = first + wp.tid()
     if indexed != 0:
@@ -102,18 +134,19 @@ def trace_pixels_kernel(
         return
     retry = status.shape[0]
     ray = direction[i]
+    own = body_at(scene, facets, pixel, body, bodies, i)
     if retry != 0:
         if int(status[i]) != SKY:
             return
         again = int(0)
         neighbours = int(0)
         if i > 0:
-            if pixel[i - 1] == pixel[i] - 1:
+            if pixel[i - 1] == pixel[i] - 1 and is_on(scene, facets, pixel, own, bodies, i - 1):
                 neighbours += 1
                 if int(status[i - 1]) != SKY:
                     again = int(1)
         if i + 1 < pixel.shape[0]:
-            if pixel[i + 1] == pixel[i] + 1:
+            if pixel[i + 1] == pixel[i] + 1 and is_on(scene, facets, pixel, own, bodies, i + 1):
                 neighbours += 1
                 if int(status[i + 1]) != SKY:
                     again = int(1)
@@ -121,7 +154,7 @@ def trace_pixels_kernel(
             return
         ray = moved_direction(ray)
     met = answered(known, out_triangle[i], out_u[i], out_v[i], out_distance[i])
-    hit = trace_ray_from(mesh_id, scene, point[i], ray, normal[i], facets[pixel[i]], body, 0, 0.0, met)
+    hit = trace_ray_from(mesh_id, scene, point[i], ray, normal[i], facets[pixel[i]], own, 0, 0.0, met)
     if retry != 0 and hit.status == SKY:
         return
     out_triangle[i] = hit.triangle
@@ -353,40 +386,81 @@ def trace_pixels(
     Returns:
         The length of `index`, or the number of pixels.
     """
+    leaving = [(0, body_of(scene, -1 if meets_own else part, convex))]
+    bodies = compact.none(OwnBody, scene.device)
+    return _trace(scene, gbuffer, scene.mirror_tracer(part), pixels, layer, leaving, bodies, index, threads, kernels)
+
+
+def trace_together(
+    scene: Scene,
+    gbuffer: GBuffer,
+    layers: Sequence[ReflectionLayer],
+    mirrors: Sequence[tuple[int, bool]],
+    bodies: wp.array,
+    threads: int = 0,
+    kernels: str = "auto",
+) -> None:
+    """The same of all pixels of several mirrors, whose layers are slices of a whole.
+
+    Args:
+        layers: Of each mirror.
+        mirrors: Its part, and whether it is convex.
+        bodies: `OwnBody` of every patch that is a mirror's.
+    """
+    whole, tracer = layers[0].whole, scene.mirror_tracer(mirrors[0][0])
+    if any(scene.mirror_tracer(part) is not tracer for part, _ in mirrors):
+        # They may not show the same things.
+        for layer, (part, convex) in zip(layers, mirrors, strict=True):
+            trace_pixels(scene, gbuffer, layer.pixels, layer, part, convex, None, threads, kernels)
+        return
+    leaving = [(first, body_of(scene, *mirror)) for (first, _, _), mirror in zip(whole.shares, mirrors, strict=True)]
+    _trace(scene, gbuffer, tracer, whole.pixels, whole, leaving, bodies, None, threads, kernels)
+
+
+def _trace(
+    scene: Scene,
+    gbuffer: GBuffer,
+    tracer: Tracer,
+    pixels: MirrorPixels,
+    layer: ReflectionLayer,
+    leaving: Sequence[tuple[int, OwnBody]],
+    bodies: wp.array,
+    index: wp.array | None,
+    threads: int,
+    kernels: str,
+) -> int:
+    """What `trace_pixels` does, of pixels body after body, from such a ray on; `bodies` of length 0: there is one."""
     count = pixels.count if index is None else len(index)
     if count == 0:
         return 0
     rays = [
-        wp.uint64(scene.mirror_tracer(part).id),
+        wp.uint64(tracer.id),
         scene.view,
         gbuffer.triangle,
         pixels.pixel,
         pixels.point,
         pixels.normal,
         pixels.direction,
-        body_of(scene, -1 if meets_own else part, convex),
-        pixels.pixel if index is None else index,
-        int(index is not None),
+        leaving[0][1],
+        bodies,
     ]
+    asked = [pixels.pixel if index is None else index, int(index is not None)]
     outputs = [layer.triangle, layer.u, layer.v, layer.distance, layer.status]
-    start = [gbuffer.triangle, pixels.pixel, rays[7], compact.none(OwnBody, scene.device)]
+    start = [gbuffer.triangle, pixels.pixel, bodies]
     width = gbuffer.camera.size[0]
-    known, left, missed = _first_met(
-        scene, scene.mirror_tracer(part), layer, start, index, False, threads, kernels, width
-    )
+    known, left, missed = _first_met(scene, tracer, layer, start, leaving, index, False, threads, kernels, width)
     if left:
-        some = _with_status(layer, index, Status.NONE) if known else rays[8:]
-        inputs = [*rays[:8], *some, known, compact.none(wp.uint8, scene.device), *outputs]
+        some = _with_status(layer, index, Status.NONE) if known else asked
+        inputs = [*rays, *some, known, compact.none(wp.uint8, scene.device), *outputs]
         launch.launch(trace_pixels_kernel, len(some[0]), inputs, scene.device, threads, split_min=TRACE_SPLIT_MIN)
     if left or missed:
-        some = _with_status(layer, index, Status.SKY) if known else rays[8:]
+        some = _with_status(layer, index, Status.SKY) if known else asked
         # The neighbours' answers are read from a copy, so that the order of threads cannot matter.
-        inputs = [*rays[:8], *some, 0, wp.clone(layer.status), *outputs]
+        inputs = [*rays, *some, 0, wp.clone(layer.status), *outputs]
         launch.launch(trace_pixels_kernel, len(some[0]), inputs, scene.device, threads, split_min=TRACE_SPLIT_MIN)
     if scene.has_hole is not None:
-        _past_holes(
-            scene, layer, scene.mirror_tracer(part), gbuffer.triangle, pixels.pixel, body=rays[7], threads=threads
-        )
+        own = {"body": leaving[0][1]} if not len(bodies) else {"bodies": bodies}
+        _past_holes(scene, layer, tracer, gbuffer.triangle, pixels.pixel, threads=threads, **own)
     return count
 
 
@@ -406,6 +480,7 @@ def _first_met(
     tracer: Tracer,
     layer: ReflectionLayer,
     start: list,
+    leaving: Sequence[tuple[int, OwnBody]],
     index: wp.array | None,
     retry: bool,
     threads: int,
@@ -428,15 +503,11 @@ def _first_met(
 
     rays = [pixels.point, pixels.normal, pixels.direction]
     outputs = [layer.triangle, layer.u, layer.v, layer.distance, layer.status]
-    start = [
-        *start,
-        tracer.own_branches(start[2]),
-        scene.view.triangle_patch,
-        compact.none(wp.uint8, scene.device) if inside is None else inside,
-    ]
-    state = bvh_vector.first_met(
-        tracer.packets, scene.triangle_records, rays, start, index, pixels.pixel, width, retry, outputs, threads
-    )
+    inside = compact.none(wp.uint8, scene.device) if inside is None else inside
+    start = [*start, scene.view.triangle_patch, inside]
+    bodies = [bvh_vector.Leaving(first, body, tracer.own_branches(body)) for first, body in leaving]
+    rays = [tracer.packets, scene.triangle_records, rays, start, bodies, index, pixels.pixel]
+    state = bvh_vector.first_met(*rays, width, retry, outputs, threads)
     return 1, bool(state & bvh_vector.LEFT), bool(state & bvh_vector.MISSED)
 
 
@@ -465,8 +536,11 @@ def trace_transmitted(
     """
     pixels, device = layer.pixels, scene.device
     bodies = scene.kept("bodies of parts", None, lambda: _part_bodies(scene))
-    start = [facet, compact.none(int, device), OwnBody(), bodies]
-    known, left, _ = _first_met(scene, scene.tracer, layer, start, index, True, threads, kernels, width, inside)
+    start = [facet, compact.none(int, device), bodies]
+    anybody = [(0, OwnBody())]
+    known, left, _ = _first_met(
+        scene, scene.tracer, layer, start, anybody, index, True, threads, kernels, width, inside
+    )
     if left:
         some = [facet if index is None else index, int(index is not None)]
         if known:
@@ -515,8 +589,9 @@ def trace_bounced(
         width: Of the picture that the pixels are of; 0: not known.
     """
     pixels = layer.pixels
-    start = [facet, compact.none(int, scene.device), OwnBody(), bodies]
-    known, left, _ = _first_met(scene, scene.tracer, layer, start, None, True, threads, kernels, width)
+    start = [facet, compact.none(int, scene.device), bodies]
+    anybody = [(0, OwnBody())]
+    known, left, _ = _first_met(scene, scene.tracer, layer, start, anybody, None, True, threads, kernels, width)
     if left:
         some = _with_status(layer, None, Status.NONE) if known else [facet, 0]
         count = len(some[0]) if known else pixels.count

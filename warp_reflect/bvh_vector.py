@@ -7,6 +7,9 @@ ray's start cost as much as any, and what a ray met of its own body it would ste
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import numpy as np
 import warp as wp
 
@@ -25,6 +28,7 @@ UNASKED = -2  # a triangle: nothing is known of what the ray meets
 TILE_WIDTH, TILE_HEIGHT = 8, 4
 # Cosine to the normal of a convex body below which a ray may still meet it: a normal between corners is not that of the facet.
 GRAZING = 1.0 / 16.0
+MOST_RUNS = 64  # of ascending pixels; more are no picture's
 JOINED = 16  # rays; tiles with fewer are joined with the next ones, as most of a walk costs the same for any number
 
 
@@ -36,12 +40,40 @@ _CONSTANTS = f"""
 """
 
 
+class Leaving(NamedTuple):
+    """Rays that follow one another among those asked, the first of them, and the body that they leave.
+
+    `branches`: Those of the tree that are the body's (`WideTree.branches_of`) if it is convex; none: it is met like anything
+    else.
+    """
+
+    first: int
+    body: OwnBody
+    branches: wp.array
+
+
+@wp.struct
+class Run:
+    """Rays whose pixels ascend."""
+
+    first_triangle: int  # of the body that they leave
+    triangle_count: int
+    branches: wp.uint64  # where that body's are, 0: none
+    first: int
+    end: int
+    first_band: int  # row of tiles
+    first_block: int
+
+
 @wp.func_native(
     vector.snippet(
         _CONSTANTS
         + TRAVERSAL
         + r"""
-    const int count = indexed != 0 ? index.shape[0] : point.shape[0];
+    int of_block = 0;
+    while (of_block + 1 < runs.shape[0] && runs.data[of_block + 1].first_block <= block) ++of_block;
+    const auto run = runs.data[of_block];
+    const int own_block = block - run.first_block;
     const float* points = (const float*)point.data;
     const float* normals = (const float*)normal.data;
     const float* directions = (const float*)direction.data;
@@ -55,9 +87,9 @@ _CONSTANTS = f"""
     // A tile that is full, whose rows of rays begin at these places.
     bool full = false;
     int row_start[TILE_HEIGHT];
-    int at[TILE_HEIGHT], stop[TILE_HEIGHT], next_place = block * BLOCK;
-    const int last_place = next_place + BLOCK < count ? next_place + BLOCK : count;
-    const int top = TILE_HEIGHT * (first_band + block);
+    int at[TILE_HEIGHT], stop[TILE_HEIGHT], next_place = run.first + own_block * BLOCK;
+    const int last_place = next_place + BLOCK < run.end ? next_place + BLOCK : run.end;
+    const int top = TILE_HEIGHT * (run.first_band + own_block);
     if (width > 0) {
         auto place_of = [&](int number, int low, int high) -> int {
             while (low < high) {
@@ -67,10 +99,10 @@ _CONSTANTS = f"""
             }
             return low;
         };
-        int low = place_of(top * width, 0, count);
+        int low = place_of(top * width, run.first, run.end);
         for (int row = 0; row < TILE_HEIGHT; ++row) {
             at[row] = low;
-            stop[row] = low = place_of((top + row + 1) * width, low, low + width < count ? low + width : count);
+            stop[row] = low = place_of((top + row + 1) * width, low, low + width < run.end ? low + width : run.end);
         }
     }
     auto take = [&]() {
@@ -226,7 +258,7 @@ _CONSTANTS = f"""
             moved[g] = I(0);
             missed[g] = live[g];
         }
-        left_out = own_branches.shape[0] > 0 && !bits(grazing) ? own_branches.data : 0;
+        left_out = !bits(grazing) ? (const unsigned char*)run.branches : 0;
         for (int round = 0; round < 2; ++round) {
             Met found[GROUPS];
             find_nearest(Tile{taken <= LANES}, missed, o, d, reach, found);
@@ -261,7 +293,7 @@ _CONSTANTS = f"""
             } else {
                 facet = igather(facets.data, pixel.shape[0] > 0 ? igather(pixel.data, own[g]) : own[g]);
             }
-            I first = I(body.first_triangle), length = I(body.triangle_count);
+            I first = I(run.first_triangle), length = I(run.triangle_count);
             if (bodies.shape[0] > 0) {
                 const I patch = igather(patches.data, ipick(facet < 0, I(0), facet));
                 EACH_LANE {
@@ -328,16 +360,14 @@ def first_met_block(
     direction: wp.array(dtype=wp.vec3),
     facets: wp.array(dtype=int),
     pixel: wp.array(dtype=int),
-    body: OwnBody,
     bodies: wp.array(dtype=OwnBody),
-    own_branches: wp.array(dtype=wp.uint8),
     patches: wp.array(dtype=int),
     inside: wp.array(dtype=wp.uint8),
     index: wp.array(dtype=int),
     indexed: int,
     numbers: wp.array(dtype=int),
     width: int,
-    first_band: int,
+    runs: wp.array(dtype=Run),
     retry: int,
     out_triangle: wp.array(dtype=int),
     out_u: wp.array(dtype=float),
@@ -360,9 +390,7 @@ def first_met_blocks_kernel(
     # Where they start:
     facets: wp.array(dtype=int),
     pixel: wp.array(dtype=int),
-    body: OwnBody,
     bodies: wp.array(dtype=OwnBody),
-    own_branches: wp.array(dtype=wp.uint8),
     patches: wp.array(dtype=int),
     inside: wp.array(dtype=wp.uint8),
     # Which are asked:
@@ -370,7 +398,7 @@ def first_met_blocks_kernel(
     indexed: int,
     numbers: wp.array(dtype=int),
     width: int,
-    first_band: int,
+    runs: wp.array(dtype=Run),
     retry: int,
     # Outputs:
     out_triangle: wp.array(dtype=int),
@@ -391,16 +419,14 @@ def first_met_blocks_kernel(
         direction,
         facets,
         pixel,
-        body,
         bodies,
-        own_branches,
         patches,
         inside,
         index,
         indexed,
         numbers,
         width,
-        first_band,
+        runs,
         retry,
         out_triangle,
         out_u,
@@ -416,6 +442,7 @@ def first_met(
     records: wp.array,
     rays: list[wp.array],
     start: list,
+    leaving: Sequence[Leaving],
     index: wp.array | None,
     numbers: wp.array,
     width: int,
@@ -429,13 +456,14 @@ def first_met(
         mesh: `bvh.Tracer.packets`.
         records: `Scene.triangle_records`.
         rays: vec3 each: points, normals on the rays' side, unit directions.
-        start: Where they start: facets; int32, where among these that of each ray is, none: in order; the body of all of
-            them; bodies of patches, none: that body; the branches of the tree that are that body's (`WideTree.branches_of`) if
-            it is convex, none: it is met like anything else; the patches of triangles; uint8, where rays have gone through a
-            surface: 1 where they are in its body (`ray_walk.trace_onward`), none: they are reflected.
+        start: Where they start: facets; int32, where among these that of each ray is, none: in order; bodies of patches, none:
+            those that the rays leave; the patches of triangles; uint8, where rays have gone through a surface: 1 where they are
+            in its body (`ray_walk.trace_onward`), none: they are reflected.
+        leaving: The rays asked, body after body.
         index: int32, which of the rays; None: all.
         numbers: int32, the pixels of rays.
-        width: Of their picture, whose tiles stay together where the pixels of the rays asked ascend; 0: there is none.
+        width: Of their picture, whose tiles stay together where the pixels of the rays asked ascend, or do so `MOST_RUNS` times;
+            0: there is none.
         retry: A ray that meets nothing is asked once more, turned by a few ulp.
         outputs: Triangle, u, v, t, status of the rays asked. What meets its own facet or body first is left: status NONE, with
             what was met (u and v as Warp's queries name them), or triangle `UNASKED`.
@@ -445,15 +473,8 @@ def first_met(
         `LEFT` and `MISSED`, where they hold for any ray.
     """
     device = rays[0].device
-    blocks, first_band = vector.block_count(len(rays[0]) if index is None else len(index)), 0
-    split = blocks >= BLOCK_SPLIT_MIN
-    if width > 0:
-        own = numbers.numpy() if index is None else numbers.numpy()[index.numpy()]
-        if own[0] >= 0 and (own[1:] > own[:-1]).all():
-            first_band = int(own[0]) // (TILE_HEIGHT * width)
-            blocks = int(own[-1]) // (TILE_HEIGHT * width) + 1 - first_band
-        else:
-            width = 0
+    asked = numbers.numpy() if index is None else numbers.numpy()[index.numpy()]
+    runs, blocks, width = _runs(leaving, asked, width)
     which = [compact.none(int, device) if index is None else index, int(index is not None)]
     state = wp.empty(blocks, dtype=int, device=device)
     inputs = [
@@ -464,10 +485,36 @@ def first_met(
         *which,
         numbers,
         width,
-        first_band,
+        wp.array(runs, dtype=Run, device=device, copy=False),
         int(retry),
         *outputs,
         state,
     ]
+    split = vector.block_count(len(asked)) >= BLOCK_SPLIT_MIN
     launch(first_met_blocks_kernel, blocks, inputs, device, threads, split_min=1 if split else blocks + 1)
     return int(np.bitwise_or.reduce(state.numpy()))
+
+
+def _runs(leaving: Sequence[Leaving], asked: np.ndarray, width: int) -> tuple[np.ndarray, int, int]:
+    """(runs of rays of one body whose pixels ascend; their blocks; the width, or 0 where they are runs of any pixels)."""
+    firsts = [each.first for each in leaving]
+    falls = np.flatnonzero(asked[1:] <= asked[:-1]) + 1 if width > 0 else []
+    if len(falls) > MOST_RUNS:
+        width = 0
+    elif len(falls):
+        firsts = sorted({*firsts, *falls.tolist()})
+    if width > 0 and asked[firsts].min() < 0:
+        width = 0
+    runs, of_body, before = [], -1, 0
+    for first, end in zip(firsts, [*firsts[1:], len(asked)], strict=True):
+        if of_body + 1 < len(leaving) and leaving[of_body + 1].first == first:
+            of_body += 1
+        band, blocks = 0, vector.block_count(end - first)
+        if width > 0:
+            band = int(asked[first]) // (TILE_HEIGHT * width)
+            blocks = int(asked[end - 1]) // (TILE_HEIGHT * width) + 1 - band
+        own = leaving[of_body]
+        triangles = own.body.first_triangle, own.body.triangle_count
+        runs.append((*triangles, own.branches.ptr or 0, first, end, band, before))
+        before += blocks
+    return np.array(runs, Run.numpy_dtype()), before, width

@@ -334,7 +334,7 @@ def reflect_scene(
             shown = [pixels[row.reflector.id] for row in rows]
             if len(rows) > 1:
                 found = TECHNIQUES[rows[0].technique].reflect_together(
-                    scene, prepared, gbuffer, shown, rows[0].settings
+                    scene, prepared, gbuffer, shown, rows[0].settings, _all_mirrors(scene, plan).bodies
                 )
             else:
                 reflect, history = TECHNIQUES[rows[0].technique].reflect, _history(previous, scene, rows[0])
@@ -434,7 +434,7 @@ def _met(
     if not left:
         return plain
     solved = {row.reflector.id for row in plan.rows if row.effects["second_bounce"].numbers.get("solved")}
-    mirrors = bounces.Mirrors(scene, [row.reflector for row in plan.rows])
+    mirrors = _all_mirrors(scene, plan)
 
     def reflected(layer: ReflectionLayer) -> wp.array:
         radiance = plain(layer)
@@ -455,6 +455,10 @@ def _met(
         return bounces.onward(*ask, kernels=settings.kernels)
 
     return met
+
+
+def _all_mirrors(scene: Scene, plan: Plan) -> bounces.Mirrors:
+    return bounces.Mirrors(scene, [row.reflector for row in plan.rows])
 
 
 def _wavy(plan: Plan) -> dict[int, Settings]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import warp as wp
+
 from warp_reflect import bvh
 from warp_reflect.layers import Camera, GBuffer, MirrorPixels, ReflectionLayer
 from warp_reflect.scene import Scene
@@ -44,24 +46,37 @@ def reflect(
     Returns:
         A layer with status CONVERGED, SKY or STEP_LIMIT; statistics `bvh`: rays traced.
     """
-    return reflect_together(scene, [prepared], gbuffer, [pixels], settings)[0]
+    layer = ReflectionLayer.unset(pixels, Technique.RAYTRACED, scene.device)
+    layer.statistics["bvh"] = bvh.trace_pixels(
+        scene,
+        gbuffer,
+        pixels,
+        layer,
+        prepared.part,
+        prepared.convex,
+        threads=settings.threads,
+        kernels=settings.kernels,
+    )
+    return layer
 
 
 def reflect_together(
-    scene: Scene, prepared: Sequence[Prepared], gbuffer: GBuffer, pixels: Sequence[MirrorPixels], settings: Settings
+    scene: Scene,
+    prepared: Sequence[Prepared],
+    gbuffer: GBuffer,
+    pixels: Sequence[MirrorPixels],
+    settings: Settings,
+    bodies: wp.array,
 ) -> list[ReflectionLayer]:
-    """The same of several mirrors, whose pixels follow one another: their layers are slices of a whole."""
+    """The same of several mirrors, whose pixels follow one another: their layers are slices of a whole.
+
+    Args:
+        bodies: Of the scene's mirrors, `bounces.Mirrors.bodies`.
+    """
     whole = ReflectionLayer.unset(MirrorPixels.joined(pixels), Technique.RAYTRACED, scene.device)
     layers = whole.parts(pixels)
-    for mirror, layer in zip(prepared, layers, strict=True):
-        layer.statistics["bvh"] = bvh.trace_pixels(
-            scene,
-            gbuffer,
-            layer.pixels,
-            layer,
-            mirror.part,
-            mirror.convex,
-            threads=settings.threads,
-            kernels=settings.kernels,
-        )
+    mirrors = [(each.part, each.convex) for each in prepared]
+    bvh.trace_together(scene, gbuffer, layers, mirrors, bodies, settings.threads, settings.kernels)
+    for layer in layers:
+        layer.statistics["bvh"] = layer.pixels.count
     return layers
