@@ -277,6 +277,27 @@ def test_packets_answer_as_warp_does_ray_by_ray(case):
         np.testing.assert_array_equal(packed[k], again)
 
 
+@pytest.mark.parametrize("spread", (0.02, 0.6))
+@pytest.mark.parametrize("offset", (0.0, 300.0))
+def test_rays_that_come_together_at_a_light_meet_what_warp_says(spread, offset):
+    """What lies without the hull of where they start and end is left out; blocks with flat sides, and of any octant."""
+    rng = np.random.default_rng(11)
+    middle = rng.uniform(-2, 2, (3000, 1, 3))
+    points = (middle + rng.normal(size=(3000, 3, 3)) * 0.05).reshape(-1, 3)
+    points = np.concatenate([points, grid_of(12)[0] * 0.3 - 2.0])
+    triangles = np.concatenate([np.arange(9000).reshape(-1, 3), 9000 + grid_of(12)[1]])
+    blocks = 120
+    origins = rng.uniform(-2, 2, (blocks, 1, 3)) + rng.normal(size=(blocks, vector.BLOCK, 3)) * spread
+    origins[::3, :, 1] = -2.0 + 1e-5
+    ends = np.array([0.1, 1.3, -0.2]) + rng.uniform(-0.1, 0.1, origins.shape)
+    d = (ends - origins).reshape(-1, 3)
+    reach = np.linalg.norm(d, axis=1)
+    origins = np.float32(origins.reshape(-1, 3) + offset)
+    own, packed = answers(points + offset, triangles, origins, d / reach[:, None], 0.999 * reach)
+    assert 0.2 < own[0].mean() < 0.8
+    np.testing.assert_array_equal(packed[0], own[0])
+
+
 def test_nothing_is_met_in_a_tree_of_points():
     """Shrunk triangles, as a scene's structure has them for what casts no shadow."""
     points, triangles = grid_of(3)

@@ -1,9 +1,15 @@
 """Rays in vectors that only ask whether anything is in their way: shadow rays, as many together as a block has points.
 
-As `wide_packets.py`, which has the sources, down the same tree, by the same tests and so with the same answers; what differs
-is made for such rays. More of them go together: a node is read, or left out, for all of them once, and an inner one is entered
-as soon as one vector of them may meet it. Most of them reach the light, and have to go past all that lies around their way: in
-which order does not matter to them, so none is made.
+As `wide_packets.py`, down the same tree, by the same tests and so with the same answers; what differs is made for such rays.
+More of them go together, and which of them meet a box is kept with it, a bit each: only those are asked further down. They end
+close to each other, at a light: no ray leaves the hull of where they start and where they end, which leaves out more than
+intervals of directions do where rays come together. In which order they meet things does not matter to them, so none is made.
+A triangle is mostly asked by a few rays of each vector: those of all vectors go four abreast (two where vectors have eight
+lanes) against four triangles.
+
+Sources: Haines and Wallace, Shaft Culling for Efficient Ray-Traced Radiosity, Eurographics Workshop on Rendering 1991 (the hull
+of two boxes); Boulos, Wald and Shirley, Geometric and Arithmetic Culling Methods for Entire Ray Packets, 2006. Other sources
+are in `wide_packets.py`. The hull is that of rounded ends, and wider by more than the rounding of a triangle's test.
 """
 
 from __future__ import annotations
@@ -14,99 +20,244 @@ from warp_reflect.wide_packets import TREE
 ANY_HIT = (
     TREE
     + r"""
-    constexpr int GROUPS = BLOCK / LANES;
+    constexpr int GROUPS = BLOCK / LANES, ABREAST = LANES / 4;
+    // A bit for each ray; those of a vector.
+    typedef unsigned long long Rays;
+    struct Waiting { int child; Rays rays; };
+    auto part_of = [](Rays rays, int g) -> unsigned { return (LaneBits)(rays >> g * LANES); };
+    auto marked = [lanes](unsigned marks) -> I { return (I(marks) << (31 - lanes())) < 0; };
+    // How far from the origin the scene reaches, on any axis.
+    float scene_width = 0.0f;
+    {
+        const auto& low = tree_mesh.bvh.node_lowers[*tree_mesh.bvh.root];
+        const auto& high = tree_mesh.bvh.node_uppers[*tree_mesh.bvh.root];
+        const float far[6] = {-low.x, -low.y, -low.z, high.x, high.y, high.z};
+        for (int k = 0; k < 6; ++k) scene_width = scene_width > far[k] ? scene_width : far[k];
+    }
+    // The hull of a box around where rays start and one around where they end: between `low` and `high`, and within sides along
+    // one axis past a corner of either box. `out_u`, `out_v` lead out of such a one on the other two, past `at`.
+    struct Side { int row_u, row_v; float out_u, out_v, at; };
+    struct Shaft { float low[3], high[3]; int count; Side sides[13]; };
+    auto shaft_of = [&](V starts_low, V starts_high, V ends_low, V ends_high) -> Shaft {
+        const float p[2][3] = {
+            {folded(starts_low.x, lesser), folded(starts_low.y, lesser), folded(starts_low.z, lesser)},
+            {folded(starts_high.x, larger), folded(starts_high.y, larger), folded(starts_high.z, larger)}};
+        const float e[2][3] = {
+            {folded(ends_low.x, lesser), folded(ends_low.y, lesser), folded(ends_low.z, lesser)},
+            {folded(ends_high.x, larger), folded(ends_high.y, larger), folded(ends_high.z, larger)}};
+        Shaft by;
+        float width = scene_width;
+        for (int axis = 0; axis < 3; ++axis) {
+            by.low[axis] = p[0][axis] < e[0][axis] ? p[0][axis] : e[0][axis];
+            by.high[axis] = p[1][axis] > e[1][axis] ? p[1][axis] : e[1][axis];
+            width = larger(width, larger(-by.low[axis], by.high[axis]));
+        }
+        const float margin = 4.0e-6f * width + 1.0e-30f;
+        const Four sign_u = {-1.0f, 1.0f, -1.0f, 1.0f}, sign_v = {-1.0f, -1.0f, 1.0f, 1.0f};
+        by.count = 0;
+        for (int u = 0; u < 3; ++u) {
+            by.low[u] -= margin;
+            by.high[u] += margin;
+            const int v = u < 2 ? u + 1 : 0;
+            // Four corners at once. Where one leads outwards and the other inwards on the way from the starts to the ends, a side
+            // runs along it.
+            const Four at_u = {p[0][u], p[1][u], p[0][u], p[1][u]}, at_v = {p[0][v], p[0][v], p[1][v], p[1][v]};
+            const Four to_u = {e[0][u], e[1][u], e[0][u], e[1][u]}, to_v = {e[0][v], e[0][v], e[1][v], e[1][v]};
+            const Four on_u = sign_u * (to_u - at_u), on_v = sign_v * (to_v - at_v);
+            const Four far_u = __builtin_elementwise_abs(on_u), far_v = __builtin_elementwise_abs(on_v);
+            const Four out_u = sign_u * far_v, out_v = sign_v * far_u;
+            const Four at = out_u * at_u + out_v * at_v + margin * (far_u + far_v);
+            const Four bent = on_u * on_v;
+            for (int k = 0; k < 4; ++k) {
+                by.sides[by.count] = Side{8 * u + (k & 1 ? 0 : 24), 8 * v + (k & 2 ? 0 : 24), out_u[k], out_v[k], at[k]};
+                by.count += bent[k] < 0.0f;
+            }
+        }
+        return by;
+    };
+    // Which of a node's eight children are not wholly outside, a bit each.
+    auto within = [&](const Shaft& by, const float* boxes) -> unsigned {
+        auto row = [&](int k) -> Row { Row v; __builtin_memcpy(&v, boxes + k, sizeof(v)); return v; };
+        RowMask out = (row(0) > by.high[0]) | (row(8) > by.high[1]) | (row(16) > by.high[2])
+            | (row(24) < by.low[0]) | (row(32) < by.low[1]) | (row(40) < by.low[2]);
+        for (int k = 0; k < by.count; ++k) {
+            const Side& side = by.sides[k];
+            out |= side.out_u * row(side.row_u) + side.out_v * row(side.row_v) > side.at;
+        }
+        return 255 & ~__builtin_bit_cast(unsigned char, __builtin_convertvector(out < 0, RowBits));
+    };
+    // Which of a chunk's four triangles are not wholly outside, by their boxes and by their corners.
+    auto four_within = [&](const Shaft& by, const float* corners) -> unsigned {
+        auto four = [&](int k) -> Four { Four v; __builtin_memcpy(&v, corners + k, sizeof(v)); return v; };
+        FourMask faces;
+        __builtin_memcpy(&faces, corners + 36, sizeof(faces));
+        FourMask out = faces < 0;
+        for (int axis = 0; axis < 3; ++axis) {
+            const Four a = four(4 * axis), b = four(4 * axis + 12), c = four(4 * axis + 24);
+            const Four ab_low = a < b ? a : b, ab_high = a > b ? a : b;
+            out |= ((ab_low < c ? ab_low : c) > by.high[axis]) | ((ab_high > c ? ab_high : c) < by.low[axis]);
+        }
+        for (int k = 0; k < by.count; ++k) {
+            const Side& side = by.sides[k];
+            const int u = (side.row_u % 24) / 2, v = (side.row_v % 24) / 2;
+            auto at = [&](int corner) -> Four { return side.out_u * four(12 * corner + u) + side.out_v * four(12 * corner + v); };
+            const Four a = at(0), b = at(1), c = at(2);
+            const Four ab = a < b ? a : b;
+            out |= (ab < c ? ab : c) > side.at;
+        }
+        unsigned some = 0;
+        for (int k = 0; k < 4; ++k) some |= (~out[k] & 1) << k;
+        return some;
+    };
     // GROUPS vectors of rays from `o` along `d`, lanes `live` of them: which meet something nearer than `reach`.
     auto find_blocked = [&](const I* live, const V* o, const V* d, const F* reach, I* blocked) {
         Way ray[GROUPS];
-        I left[GROUPS], octant[GROUPS], mask[GROUPS];
+        I octant[GROUPS];
+        unsigned left[GROUPS];
+        Rays done = 0;
+        // Of each ray alone: where it starts on its own axes; how it turns, and its reach.
+        float starts_at[4 * BLOCK], turns_by[4 * BLOCK];
+        bool listed = false;
         for (int g = 0; g < GROUPS; ++g) {
-            left[g] = live[g];
-            blocked[g] = I(0);
+            left[g] = bits(live[g]);
             ray[g] = way_of(o[g], d[g]);
             octant[g] = octant_of(d[g]);
         }
+        // A chunk's triangles and as many rays as go abreast: a bit for each of those that meet one of `met`.
+        auto chunk_blocks = [&](const float* corners, const Axes& axes, const int* of, int count, unsigned met) -> unsigned {
+            Four starts[ABREAST], turns[ABREAST];
+            _Pragma("clang loop unroll(full)") for (int k = 0; k < ABREAST; ++k) {
+                __builtin_memcpy(&starts[k], starts_at + 4 * of[k], sizeof(Four));
+                __builtin_memcpy(&turns[k], turns_by + 4 * of[k], sizeof(Four));
+            }
+            const F start = joined(starts), turn = joined(turns);
+            const V from = V{spread_out(start, I(0)), spread_out(start, I(1)), spread_out(start, I(2))};
+            auto corner = [&](int number) -> V {
+                auto of_all = [&](int axis) -> F {
+                    Four own, all[ABREAST];
+                    __builtin_memcpy(&own, corners + 12 * number + 4 * axis, sizeof(own));
+                    for (int k = 0; k < ABREAST; ++k) all[k] = own;
+                    return joined(all);
+                };
+                return sub(V{of_all(axes.x), of_all(axes.y), of_all(axes.z)}, from);
+            };
+            const unsigned asked = met * 0x1111u & (1u << 4 * count) - 1;
+            Met best{I(-1), spread_out(turn, I(3)), F(0.0f), F(0.0f)};
+            return bits(meet_corners(Any{}, 0, corner(0), corner(1), corner(2), spread_out(turn, I(0)), spread_out(turn, I(1)),
+                spread_out(turn, I(2)), marked(asked), best));
+        };
         while (true) {
-            // Rays of one octant at a time: `some` are the vectors that have any.
-            int some[GROUPS], some_count = 0;
+            // Rays of one octant at a time.
+            Rays open = 0;
             int signs = -1;
             Axes axes{true, 0, 0, 0};
             bool no_zeros = true;
-            Extremes extremes = nothing_yet();
+            V starts_low = same(3.0e38f), starts_high = same(-3.0e38f), ends_low = same(3.0e38f), ends_high = same(-3.0e38f);
             for (int g = 0; g < GROUPS; ++g) {
-                const unsigned all = bits(left[g]);
-                mask[g] = I(0);
-                if (!all) continue;
+                if (!left[g]) continue;
                 const Way& r = ray[g];
                 if (signs < 0) {
-                    const int lead = __builtin_ctz(all);
+                    const int lead = __builtin_ctz(left[g]);
                     signs = octant[g][lead];
                     axes.x = r.kx[lead]; axes.y = r.ky[lead]; axes.z = r.kz[lead];
                 }
-                const I own = left[g] & (octant[g] == signs);
+                const I own = marked(left[g]) & (octant[g] == signs);
                 if (!bits(own)) continue;
-                mask[g] = own;
-                some[some_count++] = g;
-                left[g] &= ~own;
+                open |= (Rays)bits(own) << g * LANES;
+                left[g] &= ~bits(own);
                 axes.one &= !bits(own & ((r.kz != axes.z) | (r.kx != axes.x)));
                 no_zeros &= !bits(own & (r.zero_x | r.zero_y | r.zero_z));
-                take_in(extremes, own, r, reach[g]);
+                // Beyond the scene nothing is met.
+                const F last = 4.0f * fmax(size(o[g]), F(scene_width)) / size(d[g]);
+                const V end = add(o[g], times(fmin(reach[g], last), d[g]));
+                auto take_in = [&](F v, F& low, F& high) {
+                    low = fmin(pick(own, v, F(3.0e38f)), low);
+                    high = fmax(pick(own, v, F(-3.0e38f)), high);
+                };
+                take_in(o[g].x, starts_low.x, starts_high.x); take_in(end.x, ends_low.x, ends_high.x);
+                take_in(o[g].y, starts_low.y, starts_high.y); take_in(end.y, ends_low.y, ends_high.y);
+                take_in(o[g].z, starts_low.z, starts_high.z); take_in(end.z, ends_low.z, ends_high.z);
             }
-            if (signs < 0) return;
-            const Bundle by = bundle_of(extremes, signs, no_zeros);
-            const float far = folded(extremes.furthest, larger);
-            int waiting[DEEPEST], waiting_count = 0, node = 0;
+            if (signs < 0) break;
+            const Rays all = open;
+            const Shaft shaft = shaft_of(starts_low, starts_high, ends_low, ends_high);
+            const Bundle by{(signs & 1) != 0, (signs & 2) != 0, (signs & 4) != 0, no_zeros};
+            Waiting waiting[DEEPEST];
+            int waiting_count = 0, node = 0;
+            Rays rays = open;
             while (node >= 0) {
                 const float* boxes = tree_nodes + 64 * node;
                 const int* children = (const int*)(boxes + 48);
-                Row enter;
-                for (unsigned found = children_met(by, boxes, far, enter); found != 0; found &= found - 1) {
+                // Vectors with rays that came here.
+                int some[GROUPS + 1], some_count = 0;
+                EACH_GROUP {
+                    some[some_count] = g;
+                    some_count += part_of(rays, g) != 0;
+                }
+                for (unsigned found = within(shaft, boxes); found != 0; found &= found - 1) {
                     const int slot = __builtin_ctz(found), child = children[slot];
-                    if (child == 0) continue;
                     fetch(child);
-                    waiting[waiting_count++] = 64 * node + slot;
+                    Rays met = 0;
+                    for (int k = 0; k < some_count; ++k)
+                        met |= (Rays)bits(box_met(by, ray[some[k]], reach[some[k]], boxes + slot)) << some[k] * LANES;
+                    met &= rays;
+                    waiting[waiting_count] = Waiting{child, met};
+                    waiting_count += met != 0;
                 }
                 node = -1;
                 while (waiting_count > 0) {
-                    const float* of = tree_nodes + waiting[--waiting_count];
-                    const int child = ((const int*)of)[48];
-                    auto asked_of = [&](int g) -> I { return mask[g] & box_met(by, ray[g], reach[g], of); };
-                    if (child >= 0) {
-                        for (int k = 0; k < some_count && node < 0; ++k) if (bits(asked_of(some[k]))) node = child;
-                        if (node >= 0) break;
-                        continue;
-                    }
-                    int asking[GROUPS], asking_count = 0;
-                    I asked[GROUPS];
-                    // All vectors at once: none waits for the branch of another.
-                    EACH_GROUP asked[g] = asked_of(g);
-                    EACH_GROUP if (bits(asked[g])) asking[asking_count++] = g;
-                    if (asking_count == 0) continue;
-                    bool changed = false;
+                    const int child = waiting[--waiting_count].child;
+                    rays = waiting[waiting_count].rays & open;
+                    if (!rays) continue;
+                    if (child >= 0) { node = child; break; }
                     for (int chunk = ~child;; ++chunk) {
                         const float* corners = tree_chunks + 48 * chunk;
-                        for (unsigned met = triangles_met(by, corners, far); met != 0; met &= met - 1) {
+                        unsigned met = four_within(shaft, corners);
+                        if (met) {
+                            int single[BLOCK + ABREAST], count = 0, vector_count = 0;
+                            for (Rays own = rays; own != 0; own &= own - 1) single[count++] = __builtin_ctzll(own);
+                            EACH_GROUP vector_count += part_of(rays, g) != 0;
+                            if (axes.one && count <= ABREAST * vector_count * __builtin_popcount(met)) {
+                                if (!listed) {
+                                    for (int g = 0; g < GROUPS; ++g) {
+                                        const Way& r = ray[g];
+                                        vstore4(starts_at, g * LANES, V{r.ox, r.oy, r.oz}, F(0.0f));
+                                        vstore4(turns_by, g * LANES, V{r.sx, r.sy, r.sz}, reach[g]);
+                                    }
+                                    listed = true;
+                                }
+                                for (int k = count; k % ABREAST != 0; ++k) single[k] = single[count - 1];
+                                for (int k = 0; k < count; k += ABREAST) {
+                                    const int together = count - k < ABREAST ? count - k : ABREAST;
+                                    unsigned hits = chunk_blocks(corners, axes, single + k, together, met);
+                                    // Of each ray's four triangles one is enough.
+                                    hits |= hits >> 2;
+                                    hits |= hits >> 1;
+                                    for (hits &= 0x1111u; hits != 0; hits &= hits - 1)
+                                        rays &= ~((Rays)1 << single[k + __builtin_ctz(hits) / 4]);
+                                }
+                                met = 0;
+                            }
+                        }
+                        for (; met != 0; met &= met - 1) {
                             const float* a = corners + __builtin_ctz(met);
-                            for (int k = 0; k < asking_count; ++k) {
-                                const int g = asking[k];
+                            EACH_GROUP {
+                                const unsigned asked = part_of(rays, g);
+                                if (!asked) continue;
                                 Met best{I(-1), reach[g], F(0.0f), F(0.0f)};
-                                const I hit = meet_triangle(Any{}, Chunk{}, 0, a, a + 12, a + 24, axes, ray[g], asked[g], best);
-                                if (!bits(hit)) continue;
-                                asked[g] &= ~hit;
-                                mask[g] &= ~hit;
-                                blocked[g] |= hit;
-                                changed = true;
+                                const unsigned hits = bits(
+                                    meet_triangle(Any{}, Chunk{}, 0, a, a + 12, a + 24, axes, ray[g], marked(asked), best));
+                                rays &= ~((Rays)hits << g * LANES);
                             }
                         }
                         if (!((const int*)corners)[40]) break;
                     }
-                    if (!changed) continue;
-                    int open = 0;
-                    for (int k = 0; k < some_count; ++k) if (bits(mask[some[k]])) some[open++] = some[k];
-                    some_count = open;
-                    if (open == 0) waiting_count = 0;
+                    open &= ~(waiting[waiting_count].rays & ~rays);
                 }
             }
+            done |= all & ~open;
         }
+        for (int g = 0; g < GROUPS; ++g) blocked[g] = marked(part_of(done, g));
     };
 """
 )

@@ -74,31 +74,12 @@ RAYS = r"""
     };
     // The axes that all of some rays turn theirs to, where they do (`one`).
     struct Axes { bool one; int x, y, z; };
-    // `a`, `b`, `c`: x of the corners, the other numbers STRIDE after one another. `nearest`: what is met replaces `best`;
-    // otherwise only its face does.
-    auto meet_triangle = [&](auto nearest, auto stride, int face, const float* a, const float* b, const float* c,
-                             const Axes& axes, const Way& r, I asked, Met& best) -> I {
-        constexpr int STRIDE = decltype(stride)::value;
-        F a_x, a_y, a_z, b_x, b_y, b_z, c_x, c_y, c_z;
-        if (axes.one) {
-            const int x = STRIDE * axes.x, y = STRIDE * axes.y, z = STRIDE * axes.z;
-            a_x = a[x] - r.ox; a_y = a[y] - r.oy; a_z = a[z] - r.oz;
-            b_x = b[x] - r.ox; b_y = b[y] - r.oy; b_z = b[z] - r.oz;
-            c_x = c[x] - r.ox; c_y = c[y] - r.oy; c_z = c[z] - r.oz;
-        } else {
-            auto turn_axes = [&](const float* p, F& x, F& y, F& z) {
-                const F px = p[0] - r.o.x, py = p[STRIDE] - r.o.y, pz = p[2 * STRIDE] - r.o.z;
-                x = component(r.kx, px, py, pz);
-                y = component(r.ky, px, py, pz);
-                z = component(r.kz, px, py, pz);
-            };
-            turn_axes(a, a_x, a_y, a_z);
-            turn_axes(b, b_x, b_y, b_z);
-            turn_axes(c, c_x, c_y, c_z);
-        }
-        const F Ax = a_x - r.sx * a_z, Ay = a_y - r.sy * a_z;
-        const F Bx = b_x - r.sx * b_z, By = b_y - r.sy * b_z;
-        const F Cx = c_x - r.sx * c_z, Cy = c_y - r.sy * c_z;
+    // Corners from where rays start, on their own axes; `sx`, `sy`, `sz` are the rays'. `nearest`: what is met replaces
+    // `best`; otherwise only its face does.
+    auto meet_corners = [&](auto nearest, int face, V a, V b, V c, F sx, F sy, F sz, I asked, Met& best) -> I {
+        const F Ax = a.x - sx * a.z, Ay = a.y - sy * a.z;
+        const F Bx = b.x - sx * b.z, By = b.y - sy * b.z;
+        const F Cx = c.x - sx * c.z, Cy = c.y - sy * c.z;
         F edge_u = difference(Cx, By, Cy, Bx), edge_v = difference(Ax, Cy, Ay, Cx), edge_w = difference(Bx, Ay, By, Ax);
         const unsigned exact = bits(asked & ((edge_u == 0.0f) | (edge_v == 0.0f) | (edge_w == 0.0f)));
         for (unsigned left = exact; left != 0; left &= left - 1) {
@@ -112,7 +93,7 @@ RAYS = r"""
         I hit = asked & ~((low < 0.0f) & (high > 0.0f)) & (det != 0.0f);
         // Most that is asked is passed by: no need to divide.
         if constexpr (!decltype(nearest)::value) if (!bits(hit)) return hit;
-        const F along = edge_u * (r.sz * a_z) + edge_v * (r.sz * b_z) + edge_w * (r.sz * c_z);
+        const F along = edge_u * (sz * a.z) + edge_v * (sz * b.z) + edge_w * (sz * c.z);
         const F inverse_det = 1.0f / det;
         const F t = along * inverse_det;
         hit &= (pick(det < 0.0f, -along, along) >= 0.0f) & (t < best.t) & (t >= 0.0f);
@@ -123,6 +104,27 @@ RAYS = r"""
         }
         best.face = ipick(hit, I(face), best.face);
         return hit;
+    };
+    // `a`, `b`, `c`: x of the corners, the other numbers STRIDE after one another.
+    auto meet_triangle = [&](auto nearest, auto stride, int face, const float* a, const float* b, const float* c,
+                             const Axes& axes, const Way& r, I asked, Met& best) -> I {
+        constexpr int STRIDE = decltype(stride)::value;
+        V p0, p1, p2;
+        if (axes.one) {
+            const int x = STRIDE * axes.x, y = STRIDE * axes.y, z = STRIDE * axes.z;
+            p0 = V{a[x] - r.ox, a[y] - r.oy, a[z] - r.oz};
+            p1 = V{b[x] - r.ox, b[y] - r.oy, b[z] - r.oz};
+            p2 = V{c[x] - r.ox, c[y] - r.oy, c[z] - r.oz};
+        } else {
+            auto turned = [&](const float* p) -> V {
+                const F px = p[0] - r.o.x, py = p[STRIDE] - r.o.y, pz = p[2 * STRIDE] - r.o.z;
+                return V{component(r.kx, px, py, pz), component(r.ky, px, py, pz), component(r.kz, px, py, pz)};
+            };
+            p0 = turned(a);
+            p1 = turned(b);
+            p2 = turned(c);
+        }
+        return meet_corners(nearest, face, p0, p1, p2, r.sx, r.sy, r.sz, asked, best);
     };
     struct Nearest { enum { value = 1 }; };
     struct Any { enum { value = 0 }; };

@@ -138,8 +138,16 @@ CODES += [SAME_TURN, FLATNESS, LEAST_COUNT, SHARP, LEAST_SPREAD, STEEP, TILE]
         const V to_centre = sub(spread(light.centre), p);
         return ~(root(dot(to_centre, to_centre)) <= light.radius);
     };
+    // Almost all points ask distant lights: where those of the next block start is on its way while these go. A picture's tiles
+    // are too many rows for the processor to see that coming.
+    for (int v = 0; v < GROUPS && lights.distant.shape[0] > 0; ++v) {
+        const float* next = rows + first_of[v] + (tiled ? LANES : BLOCK);
+        for (int r = 0; r < 6; ++r) __builtin_prefetch(next + r * stride);
+    }
     // A light: a distant one, else a shape, or the sky.
     constexpr int SKY = -1;
+    // As many rays are sorted at once, at most, by parts of what they are sent to.
+    constexpr int RAYS = 16 * BLOCK, PARTS = 16;
     const int area_count = lights.areas.shape[0], distant_count = lights.distant.shape[0];
     const bool to_sky = mode == sky_mode, only_first = mode == first_mode, each = mode == each_mode;
     const bool sharing = mode == shared_mode, to_all = !to_sky && !only_first && !each && !sharing;
@@ -288,7 +296,8 @@ CODES += [SAME_TURN, FLATNESS, LEAST_COUNT, SHARP, LEAST_SPREAD, STEEP, TILE]
                 for (unsigned left = marks[v] & ((1u << columns) - 1) << from; left != 0; left &= left - 1)
                     asking[asking_count++] = v * LANES + __builtin_ctz(left);
         // The starts of those that ask, one after the other.
-        float start[11][2 * BLOCK], brought[2 * BLOCK], arrived[2 * BLOCK];
+        float start[11][2 * BLOCK], brought[2 * BLOCK], arrived[2 * BLOCK], brought_by[RAYS], arrived_by[RAYS];
+        int of[RAYS], which[RAYS], order[RAYS];
         for (int v = 0; v * LANES < asking_count; ++v) {
             const I asked = v * LANES + lanes() < asking_count ? iload(asking + v * LANES) : I(asking[0]);
             const I own = points_of(asked);
@@ -314,73 +323,140 @@ CODES += [SAME_TURN, FLATNESS, LEAST_COUNT, SHARP, LEAST_SPREAD, STEEP, TILE]
             store(brought + v * LANES, F(0.0f));
             store(arrived + v * LANES, F(0.0f));
         }
-        // Rays of a point lie side by side: they start at the same place.
+        // All of a point's rays, point by point; they go on their way in the order of where on the light they end.
         int point = 0, sample = known_count;
         const bool each_once = ray_count == known_count + 1;
+        int together_count = BLOCK;
+        bool round = true;
+        if (!distant && !each_once && asking_count > 0) {
+            // Rays go together that start close to each other, or that end so: how many are asked for at once decides it.
+            auto span = [&](const float* of_axis) -> float {
+                F least = F(3.0e38f), most = F(-3.0e38f);
+                for (int v = 0; v * LANES < asking_count; ++v) {
+                    least = fmin(load(of_axis + v * LANES), least);
+                    most = fmax(load(of_axis + v * LANES), most);
+                }
+                return folded(most, larger) - folded(least, lesser);
+            };
+            auto length = [](float x, float y, float z) -> float { return __builtin_sqrtf(x * x + y * y + z * z); };
+            const float of_points = length(span(start[0]), span(start[1]), span(start[2]));
+            float of_light = 3.0e38f;
+            if (!to_sky) {
+                const auto& area = lights.areas.data[k];
+                round = area.kind == sphere || area.sides != 4 && area.kind != cylinder;
+                of_light = area.kind == sphere
+                    ? 2.0f * area.radius
+                    : length(area.x[0], area.x[1], area.x[2]) + length(area.y[0], area.y[1], area.y[2]);
+            }
+            const float all = (float)(asking_count * (ray_count - known_count));
+            float narrowest = 3.0e38f;
+            for (int count = BLOCK; count <= RAYS; count *= 2) {
+                const float share = count < all ? count / all : 1.0f;
+                const float wide = of_points * share + of_light * __builtin_sqrtf((float)BLOCK / count);
+                if (wide < narrowest) {
+                    narrowest = wide;
+                    together_count = count;
+                }
+                if (share == 1.0f) break;
+            }
+        }
         while (point < asking_count && known_count < ray_count) {
-            int of[BLOCK], which[BLOCK], used = 0;
-            for (; used < BLOCK && point < asking_count; ++used) {
+            int used = 0;
+            for (; used < together_count && point < asking_count; ++used) {
                 of[used] = point;
                 which[used] = sample;
                 if (++sample == ray_count) { sample = known_count; ++point; }
             }
-            for (int l = used; l < BLOCK; ++l) { of[l] = of[used - 1]; which[l] = which[used - 1]; }
-            V p[GROUPS], d[GROUPS];
-            F weight[GROUPS], reach[GROUPS];
-            I sent[GROUPS], met[GROUPS];
-            for (int g = 0; g < GROUPS; ++g) {
-                const I own = iload(of + g * LANES);
-                const F s = __builtin_convertvector(iload(which + g * LANES), F);
-                const bool alone = of[g * LANES] == of[(g + 1) * LANES - 1];
-                auto pull = [&](int r) -> F {
-                    const float* from = start[r] + of[g * LANES];
-                    return alone ? F(from[0]) : each_once ? load(from) : gather(start[r], own);
-                };
-                p[g] = V{pull(0), pull(1), pull(2)};
-                sent[g] = g * LANES + lanes() < used;
-                if (distant) {
-                    d[g] = flushed(spread(lights.distant.data[light].to_light));
-                    reach[g] = F(3.0e38f);
-                    weight[g] = F(1.0f);
-                    continue;
+            const int whole = (used + BLOCK - 1) / BLOCK * BLOCK;
+            for (int i = used; i < whole; ++i) { of[i] = of[used - 1]; which[i] = which[used - 1]; }
+            const bool sorted = used > BLOCK;
+            if (sorted) {
+                int part[RAYS], begin[PARTS + 1] = {};
+                for (int from = 0; from < used; from += LANES) {
+                    const I own = iload(of + from);
+                    const F s = __builtin_convertvector(iload(which + from), F);
+                    const F x = place_x(s, gather(start[9], own)), y = place_y(s, gather(start[10], own));
+                    const I column = __builtin_convertvector(4.0f * x, I), row = __builtin_convertvector(4.0f * y, I);
+                    // Of what is round y is a turn: quarters of it first.
+                    const I turned = __builtin_convertvector(8.0f * y, I);
+                    const I by_turn = (turned >> 1) * 4 + (column >> 1) * 2 + (turned & 1);
+                    const I by_square = (row >> 1) * 8 + (column >> 1) * 4 + (row & 1) * 2 + (column & 1);
+                    istore(part + from, round ? by_turn : by_square);
                 }
-                const V n = V{pull(3), pull(4), pull(5)};
-                const F x = place_x(s, pull(9)), y = place_y(s, pull(10));
-                if (to_sky) {
-                    // shadows.sky_ray
-                    F cosine, sine;
-                    V t1, t2;
-                    basis(n, t1, t2);
-                    turn(y, cosine, sine);
-                    d[g] = add(times(root(x), add(times(cosine, t1), times(sine, t2))), times(root(fmax(1.0f - x, F(0.0f))), n));
-                    reach[g] = F(3.0e38f);
-                    weight[g] = F(1.0f);
-                    sent[g] &= dot(d[g], V{pull(6), pull(7), pull(8)}) > 0.0f;
-                    d[g] = flushed(d[g]);
-                    continue;
-                }
-                const auto& area = lights.areas.data[k];
-                const Ray ray = area_ray(area, p[g], n, x, y);
-                d[g] = flushed(ray.d);
-                reach[g] = ray.reach;
-                weight[g] = ray.weight;
-                sent[g] &= outside(area, p[g]) & (ray.weight > 0.0f);
+                for (int i = 0; i < used; ++i) ++begin[part[i] + 1];
+                for (int i = 1; i < PARTS; ++i) begin[i] += begin[i - 1];
+                for (int i = 0; i < used; ++i) order[begin[part[i]]++] = i;
+                for (int i = used; i % BLOCK != 0; ++i) order[i] = order[used - 1];
             }
-            find_blocked(sent, p, d, reach, met);
-            for (int g = 0; g * LANES < used; ++g) {
-                const I free = sent[g] & ~met[g];
-                if (each_once) {
-                    store(brought + of[g * LANES], pick(sent[g], weight[g], F(0.0f)));
-                    store(arrived + of[g * LANES], pick(free, weight[g], F(0.0f)));
-                    continue;
+            for (int from = 0; from < used; from += BLOCK) {
+                V p[GROUPS], d[GROUPS];
+                F weight[GROUPS], reach[GROUPS];
+                I sent[GROUPS], met[GROUPS];
+                for (int g = 0; g < GROUPS; ++g) {
+                    const int at = from + g * LANES;
+                    const I own = sorted ? igather(of, iload(order + at)) : iload(of + at);
+                    const F s = __builtin_convertvector(sorted ? igather(which, iload(order + at)) : iload(which + at), F);
+                    const bool alone = of[at] == of[at + LANES - 1] && !sorted;
+                    auto pull = [&](int r) -> F {
+                        const float* first = start[r] + own[0];
+                        return alone ? F(first[0]) : each_once ? load(first) : gather(start[r], own);
+                    };
+                    p[g] = V{pull(0), pull(1), pull(2)};
+                    sent[g] = from + g * LANES + lanes() < used;
+                    if (distant) {
+                        d[g] = flushed(spread(lights.distant.data[light].to_light));
+                        reach[g] = F(3.0e38f);
+                        weight[g] = F(1.0f);
+                        continue;
+                    }
+                    const V n = V{pull(3), pull(4), pull(5)};
+                    const F x = place_x(s, pull(9)), y = place_y(s, pull(10));
+                    if (to_sky) {
+                        // shadows.sky_ray
+                        F cosine, sine;
+                        V t1, t2;
+                        basis(n, t1, t2);
+                        turn(y, cosine, sine);
+                        const V across = times(root(x), add(times(cosine, t1), times(sine, t2)));
+                        d[g] = add(across, times(root(fmax(1.0f - x, F(0.0f))), n));
+                        reach[g] = F(3.0e38f);
+                        weight[g] = F(1.0f);
+                        sent[g] &= dot(d[g], V{pull(6), pull(7), pull(8)}) > 0.0f;
+                        d[g] = flushed(d[g]);
+                        continue;
+                    }
+                    const auto& area = lights.areas.data[k];
+                    const Ray ray = area_ray(area, p[g], n, x, y);
+                    d[g] = flushed(ray.d);
+                    reach[g] = ray.reach;
+                    weight[g] = ray.weight;
+                    sent[g] &= outside(area, p[g]) & (ray.weight > 0.0f);
                 }
-                float brings[LANES], arrives[LANES];
-                store(brings, pick(sent[g], weight[g], F(0.0f)));
-                store(arrives, pick(free, weight[g], F(0.0f)));
-                for (int l = 0; l < LANES && g * LANES + l < used; ++l) {
-                    brought[of[g * LANES + l]] += brings[l];
-                    arrived[of[g * LANES + l]] += arrives[l];
+                find_blocked(sent, p, d, reach, met);
+                for (int g = 0; from + g * LANES < used; ++g) {
+                    const int at = from + g * LANES;
+                    const F brings = pick(sent[g], weight[g], F(0.0f)), arrives = pick(sent[g] & ~met[g], weight[g], F(0.0f));
+                    if (!sorted) {
+                        store(brought_by + at, brings);
+                        store(arrived_by + at, arrives);
+                        continue;
+                    }
+                    for (int l = 0; l < LANES && at + l < used; ++l) {
+                        brought_by[order[at + l]] = brings[l];
+                        arrived_by[order[at + l]] = arrives[l];
+                    }
                 }
+            }
+            if (each_once) {
+                for (int i = 0; i < used; i += LANES) {
+                    store(brought + of[i], load(brought_by + i));
+                    store(arrived + of[i], load(arrived_by + i));
+                }
+                continue;
+            }
+            for (int i = 0; i < used; ++i) {
+                brought[of[i]] += brought_by[i];
+                arrived[of[i]] += arrived_by[i];
             }
         }
         for (int a = 0; a < asking_count; ++a) {
