@@ -120,7 +120,8 @@ def trace_pixels_kernel(
     With a `status` a miss beside a hit, or without a neighbour, is asked again: a kernel of its own would be compiled for as long
     as this one.
     """
-    i = first + wp.tid()
+    row, _ = wp.tid()
+    i = first + row
     if indexed != 0:
         i = index[i]
         if i < 0:

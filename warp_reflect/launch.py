@@ -7,6 +7,10 @@ a kernel therefore takes the first index of its slice as its first argument and 
 cost more, or that begins late. Warp's CPU atomics are plain memory operations: kernels launched here write only to
 elements that belong to their own index (or to their own row band, see raster.py), so that results are
 bit-equal at any number of threads.
+
+Warp builds a kernel twice for a CPU, for arrays without gaps between elements and for any, unless the kernel takes its number
+as the first of two, `k, _ = wp.tid()`. Kernels that are long to build and long at each element do: theirs gain nothing from the
+second form. Light ones would pay for the division that tells two numbers apart.
 """
 
 from __future__ import annotations

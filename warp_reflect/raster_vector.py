@@ -420,7 +420,8 @@ def draw_blocks_kernel(
 
     Slices begin at multiples of `BLOCK`; the target is `WIDTH_MIN` pixels wide or more.
     """
-    begin = (first + wp.tid()) * BLOCK
+    task, _ = wp.tid()
+    begin = (first + task) * BLOCK
     part = begin / step
     count = wp.min(part * step + survivor_count[part] - begin, BLOCK)
     left = draw_block(

@@ -581,7 +581,8 @@ def surface_channels_kernel(
     out_prim: wp.array(dtype=int),
 ):
     """One thread per pixel."""
-    i = first + wp.tid()
+    row, _ = wp.tid()
+    i = first + row
     tri = triangle[i]
     if tri < 0:
         out_depth[i] = 0.0

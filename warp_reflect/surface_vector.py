@@ -160,7 +160,8 @@ def mirror_blocks_kernel(
     out_direction: wp.array(dtype=wp.vec3),
 ):
     """One thread per `blocks` blocks of mirror pixels."""
-    task = first + wp.tid()
+    own, _ = wp.tid()
+    task = first + own
     for block in range(task * blocks, wp.min((task + 1) * blocks, (pixel.shape[0] + BLOCK - 1) / BLOCK)):
         left = mirror_block(
             block,
