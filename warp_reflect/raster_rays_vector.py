@@ -201,8 +201,7 @@ _TARGET = (
             down[each] = dx[each] * 256;
         }
         const F last = __builtin_convertvector(columns, F);
-        int row_count = 0;
-        EACH_LANE row_count = rows[l] >= row_count ? rows[l] + 1 : row_count;
+        const int row_count = __builtin_reduce_max(rows) + 1;
         I run = ((own + lanes()) << 24) + 1;
         unsigned owners = 0;
         for (int y = 0; y < row_count; ++y, run += 1 << 16) {
@@ -264,10 +263,19 @@ _TARGET = (
         V p[3];
         I corner[3];
         I last = I(0);
-        _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each) {
-            corner[each] = igather(plane_corner_of, 3 * (begin + owner) + each);
-            last |= corner[each] >= points.shape[0] - 1;
+        if (end < triangles.shape[0]) {
+            int at[LANES];
+            istore(at, 3 * (begin + owner));
+            F of[4];
+            fours((const float*)plane_corner_of, at, of);
+            _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each)
+                corner[each] = __builtin_bit_cast(I, of[each]);
+        } else {
+            // Of the last triangle there are but three words to read.
+            _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each)
+                corner[each] = igather(plane_corner_of, 3 * (begin + owner) + each);
         }
+        _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each) last |= corner[each] >= points.shape[0] - 1;
         // Of the last point there are but three floats to read.
         if (bits(last)) {
             _Pragma("clang loop unroll(full)") for (int each = 0; each < 3; ++each) p[each] = vgather(point_of, corner[each]);
@@ -297,10 +305,15 @@ _TARGET = (
         const int fragment = (int)((unsigned)runs[k] >> 8), length = runs[k] & 255;
         const int at = cell_of[fragment >> 16] + (fragment >> 8 & 255) * width + (fragment & 255);
         __builtin_prefetch(keys + at);
-        // Two rays fill a cache line.
-        for (int part = 0; part < length; part += 2) __builtin_prefetch(ray_of + 8 * (at + part));
+        // Two rays fill a cache line; runs are hardly ever longer than those of three.
+        __builtin_prefetch(ray_of + 8 * at);
+        __builtin_prefetch(ray_of + 8 * (at + length / 2));
         __builtin_prefetch(ray_of + 8 * (at + length - 1));
-        for (int part = 0; part < length; part += LANES) istore(list + listed + part, fragment + part + lanes());
+        istore(list + listed, fragment + lanes());
+        if (length > 4) {
+            for (int part = 2; part < length; part += 2) __builtin_prefetch(ray_of + 8 * (at + part));
+            for (int part = LANES; part < length; part += LANES) istore(list + listed + part, fragment + part + lanes());
+        }
         listed += length;
         if (listed >= LISTED || k + 1 == run_count) flush();
     }
