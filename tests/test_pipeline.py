@@ -590,6 +590,12 @@ def test_world_that_moves_is_not_shared(stage, device):
     second = first.at(5.0)
     assert not second.shares_world(first)
     later = wr.make_plan(second, size=(40, 30), method="reflector_map", earlier=plan)
+    # A map is of its mirror alone, which stands still; the picture of what stands around it is not.
+    assert later.prepared(later.rows[0]) is plan.prepared(plan.rows[0])
+    plan, later = (
+        wr.make_plan(each, size=(40, 30), method="environment", earlier=known)
+        for each, known in ((first, None), (second, plan))
+    )
     assert later.prepared(later.rows[0]) is not plan.prepared(plan.rows[0])
 
 

@@ -3,9 +3,11 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import warp_reflect as wr
+from warp_reflect.techniques import TECHNIQUES
 
 FOLDER = Path(__file__).resolve().parents[1] / "usd_scenes"
 SIZE = 160, 90
@@ -124,6 +126,29 @@ def test_plans_of_a_kitchen_by_other_settings(settings, tmp_path):
 def test_plans_of_a_crossing(method):
     for time, plan, fresh in plans(str(FOLDER / "city_block.usda"), (2.0, 3.0, 30.0, 48.0), wr.Settings(), method):
         assert told(plan) == told(fresh), time
+
+
+@pytest.mark.parametrize("method, count", [("reflector_map", 3), ("quadric", 2), ("explosion_map", 3)])
+def test_what_is_prepared_for_mirrors_that_stand_still_is_kept(method, count, tmp_path, monkeypatch):
+    """The sphere moves between the first two times alone; the table between all."""
+    stops = MIRROR.replace("9: (0.3", "5: (0.3")
+    path, settings = kitchen(tmp_path, TABLE + stops), wr.Settings(**FEW, map_resolution=32, shadows="off")
+    module, made = TECHNIQUES[method], []
+    prepare = module.prepare
+    monkeypatch.setattr(module, "prepare", lambda *given: made.append(given[1].part) or prepare(*given))
+    scene = wr.load_stage(path, time=1.0)
+    plan = wr.make_plan(scene, size=SIZE, settings=settings, method=method)
+    frame = wr.render_frame(scene, plan)
+    assert len(made) == count
+    for time, again in ((5.0, 1), (7.0, 0), (9.0, 0), (1.0, 1)):
+        made.clear()
+        scene = scene.at(time)
+        frame = wr.render_frame(scene, plan, previous=frame)
+        assert len(made) == again, time
+        fresh = wr.load_stage(path, time=time)
+        whole = wr.render_frame(fresh, wr.make_plan(fresh, size=SIZE, settings=settings, method=method))
+        for name in ("RGBA", "reflectedPoint", "status"):
+            np.testing.assert_array_equal(frame[name], whole[name], err_msg=f"{name} at {time}")
 
 
 def test_findings_that_are_kept_too_long_are_noticed(tmp_path):

@@ -60,6 +60,8 @@ from warp_reflect.techniques import TECHNIQUES, TOGETHER
 
 METHODS = ("auto", "reference", "none")
 OF_ALL_TIMES = ("layered_environment",)  # prepare something that holds nothing that moves
+# Prepare what follows from the mirror alone and where it stands; reflector maps but for grids and maps that were baked.
+OF_MIRROR = ("planar", "quadric", "reflector_map", "explosion_map", "raytraced")
 DEFAULT_SIZE = (960, 540)  # usdrecord's default width at 16:9
 # Of a time asked for: a frame that takes more is late, and what is dearer may be predicted to take as much; between them a
 # choice stands.
@@ -573,13 +575,24 @@ def with_techniques(plan: Plan, techniques: Mapping[int, str]) -> Plan:
 
 def _take_over(made: Plan, earlier: Plan | None) -> None:
     """Hand over what an earlier plan's techniques prepared, where it is still that."""
-    if earlier is None or not earlier.scene.shares_world(made.scene):
+    if earlier is None:
         return
     before = {row.reflector: row for row in earlier.rows}
     for row in made.rows:
         known = before.get(row.reflector)
-        if known is not None and (known.technique, known.settings) == (row.technique, row.settings):
-            made._prepared |= {k: v for k, v in earlier._prepared.items() if k == row.reflector.id}
+        if known is None or known.settings != row.settings:
+            continue
+        number = row.reflector.id
+        if known.technique == row.technique and number in earlier._prepared and _holds(made, earlier, row):
+            made._prepared[number] = earlier._prepared[number]
+
+
+def _holds(made: Plan, earlier: Plan, row: PlanRow) -> bool:
+    """Whether what was prepared for a row is what would be now."""
+    if earlier.scene.shares_world(made.scene):
+        return True
+    alone = row.technique in OF_MIRROR and not (row.settings.grid_share or row.settings.grid_error_px)
+    return alone and not made.scene.data.baked_maps and made.scene.stands_as_in(earlier.scene, row.reflector.part)
 
 
 def find_camera(scene: Scene, camera: str | Camera | None, size: tuple[int, int]) -> Camera:

@@ -445,6 +445,10 @@ class Scene:
         """Whether two scenes are the same arrays, seen at two times."""
         return self.view is other.view
 
+    def stands_as_in(self, earlier: Scene, part: int) -> bool:
+        """Whether a part was laid out with an earlier time of the same stage, and neither moved nor was bent since."""
+        return part < len(earlier.parts) and self.parts[part] is earlier.parts[part]
+
     def kept(self, what: str, given, make: Callable, of: PartRange | None = None):
         """What `make()` gives, made again where `given` is not what it was made for.
 
