@@ -89,6 +89,30 @@ def test_launches_of_one_kernel_differ_in_their_arguments_alone():
     assert gone() is None
 
 
+@wp.struct
+class Scale:
+    factor: float
+
+
+@wp.kernel
+def scale_kernel(first: int, by: Scale, plus: wp.vec3, more: float, out_sum: wp.array(dtype=wp.vec3)):
+    i = first + wp.tid()
+    out_sum[i] = by.factor * float(i) * plus + wp.vec3(more, more, more)
+
+
+def test_structures_vectors_and_numbers_are_those_of_each_launch():
+    by = Scale()
+    for factor, plus, more in ((1.0, (1, 2, 3), 0.5), (2.0, (3, 2, 1), 4), (0.5, (0, 1, 0), np.float32(0.25))):
+        by.factor = factor
+        for threads in (1, 2):
+            out = wp.zeros(9000, dtype=wp.vec3, device="cpu")
+            launch.launch(scale_kernel, 9000, [by, wp.vec3(*plus), more, out], "cpu", threads)
+            expected = factor * np.arange(9000)[:, None] * np.array(plus) + float(more)
+            np.testing.assert_array_equal(out.numpy(), expected.astype(np.float32))
+    with pytest.raises(RuntimeError, match="more"):
+        launch.launch(scale_kernel, 9000, [by, wp.vec3(), "much", out], "cpu", 1)
+
+
 @pytest.mark.parametrize("failing", [0, 1, 2])
 def test_failure_of_any_thread_is_raised_when_all_are_done(failing):
     done = []

@@ -39,6 +39,7 @@ PIECES_A_ROOT_MS, MOST_PIECES = 1.6, 8
 # Environment variable: the most threads of a launch where `threads` is 0, for processes that share a machine. It cuts
 # launches, it plans nothing: a frame's plan is the same in all of them.
 CORES_VARIABLE = "WARP_REFLECT_THREADS"
+NUMBERS = {int: int, wp.int32: int, float: float, wp.float32: float}  # what is given for a kernel's numbers
 CPU_BLOCK_DIM = 1  # what Warp launches with on the CPU
 # Threads of a block on CUDA. Of Warp's own 256 a multiprocessor holds one block where a thread has more than 128 registers, and
 # leaves idle what is not a whole one: with 160 it holds 8 warps of 256, 12 of 128 (`tools/cubin_registers.py`).
@@ -67,7 +68,7 @@ ALIKE_FLAGS = PLAIN_FLAGS, FINITE_FLAGS, VECTOR_FLAGS
 
 # Of launches that were split, by their kernel and (binary) order of magnitude: what an element took last time. [s]
 _measured: dict[tuple[wp.Kernel, int], float] = {}
-_made: dict[wp.Kernel, wp.Launch] = {}
+_made: dict[wp.Kernel, tuple[wp.Launch, list]] = {}  # with the `_kind` of each argument after the first
 _recordings: list[list[tuple[str, int]]] = []
 _as_device: list[bool] = []
 _unread = threading.local()
@@ -215,8 +216,7 @@ def _take_slices(own: wp.Launch, left: deque[tuple[int, int]], spent: list[float
             first, length = left.popleft()
         except IndexError:  # another thread was faster
             break
-        own.set_dim(length)
-        own.set_param_at_index(0, first)
+        _set_slice(own, first, length)
         own.launch()
     spent.append(thread_time() - start)
 
@@ -224,31 +224,49 @@ def _take_slices(own: wp.Launch, left: deque[tuple[int, int]], spent: list[float
 def _packed(kernel: wp.Kernel, count: int, inputs: list, device) -> wp.Launch:
     """A launch on the CPU, ready to run.
 
-    The first one of a kernel is made by Warp and kept, without its arrays. The others differ from it in their arguments: an
-    array of just the declared kind is taken as it is, anything else is looked at by Warp.
+    The first one of a kernel is made by Warp and kept, without its arrays. The others differ from it in their arguments: what
+    is just of the declared kind is taken as it is, anything else is looked at by Warp. All of this is run with cold caches,
+    after a kernel that went over a picture: what it does counts several times over.
     """
-    made, arguments = _made.get(kernel), kernel.adj.args
-    if (
-        made is None
-        or len(inputs) + 1 != len(arguments)
-        or made.module_exec is not kernel.module.load(device, CPU_BLOCK_DIM)
-    ):
+    made, kinds = _made.get(kernel, (None, ()))
+    if made is None or len(inputs) != len(kinds) or made.module_exec is not kernel.module.load(device, CPU_BLOCK_DIM):
         _load(kernel, device)
         made = wp.launch(kernel, dim=count, inputs=[0, *inputs], device=device, record_cmd=True)
         if made.kernel is kernel:  # and not the one of several that the arguments' types ask for
-            _made[kernel] = _own(made)
-            _made[kernel].fwd_args = []
-        return made
+            own = _own(made)
+            own.fwd_args = []
+            _made[kernel] = own, [_kind(argument.type) for argument in kernel.adj.args[1:]]
+        return _own(made)
     own = _own(made)
     own.fwd_args = [0, *inputs]
-    for k, value in enumerate(inputs, 1):
-        kind = arguments[k].type
-        if type(value) is wp.array is type(kind) and value.dtype is kind.dtype and value.ndim == kind.ndim:
-            own.params[k + 1] = value.__ctype__()
-        else:
-            own.set_param_at_index(k, value)
-    own.set_dim(count)
+    params = own.params
+    for k, (value, kind) in enumerate(zip(inputs, kinds, strict=True), 2):
+        given = type(value)
+        if given is wp.array:
+            if kind == (value.dtype, value.ndim):
+                params[k] = value.__ctype__()
+                continue
+        elif given is kind:
+            params[k] = type(params[k])(value) if given is int or given is float else value.__ctype__()
+            continue
+        own.set_param_at_index(k - 1, value)
+    _set_slice(own, 0, count)
     return own
+
+
+def _kind(declared) -> object:
+    """What `_packed` takes as it is for a declared argument: type and dimensions of an array, a structure, a number."""
+    if type(declared) is wp.array:
+        return declared.dtype, declared.ndim
+    return NUMBERS.get(declared, getattr(declared, "instance_type", None))
+
+
+def _set_slice(own: wp.Launch, first: int, count: int) -> None:
+    """What `wp.Launch.set_dim` and `set_param_at_index` do, of one or of two dimensions: they take ten times as long."""
+    dimensions = getattr(own.kernel.adj, "kernel_dim", 1)  # all the same to older versions of Warp
+    own.bounds = own.params[0] = type(own.bounds)((count, 1)[:dimensions])
+    own.params[1] = type(own.params[1])(first)
+    own.fwd_args[:1] = [first]
 
 
 def _own(packed: wp.Launch) -> wp.Launch:
