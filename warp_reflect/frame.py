@@ -407,7 +407,7 @@ def _shown(
         shown = dataclasses.replace(shown, normals=normals)
     met = _met(scene, plan, shown, interfaces, layers)
     if interfaces is None:
-        return dataclasses.replace(shown, seen=met), met
+        return dataclasses.replace(shown, seen=met, add=shown.add if met is shown.seen else None), met
     from warp_reflect.transmission import behind
 
     def seen(layer: ReflectionLayer) -> wp.array:
@@ -416,7 +416,7 @@ def _shown(
             return radiance
         return behind(scene, gbuffer, interfaces, layer, radiance, plan.settings, met)
 
-    return dataclasses.replace(shown, seen=seen), met
+    return dataclasses.replace(shown, seen=seen, add=None), met
 
 
 def _met(

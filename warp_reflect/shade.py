@@ -65,12 +65,15 @@ class Shown:
         looks: `Look` [height * width], see `textures.prepare_looks`.
         normals: vec3 [height * width], see `normal_maps.prepare_normals`.
         seen: Radiance, vec3 [n], that a layer's rays see.
+        add: The same, but what a layer does not know itself goes with the mirrors' weights into a picture and the weights, and
+            of length 0 is returned; None: there is no such way.
     """
 
     gbuffer: GBuffer
     looks: wp.array
     normals: wp.array
     seen: Callable[[ReflectionLayer], wp.array]
+    add: Callable[[ReflectionLayer, tuple[wp.array, wp.array]], wp.array] | None = None
 
 
 # Of what is shown, a mirror's layer and what its pixels see in a sharp mirror: what they see in this one.
@@ -551,11 +554,13 @@ def seen_radiance(
     threads: int = 0,
     shadows: Shadows | None = None,
     kernels: str = "auto",
+    into: tuple[wp.array, wp.array] | None = None,
 ) -> wp.array:
     """What a mirror's pixels see, before the mirror's own weight.
 
     Args:
         kernels: `Settings.kernels`.
+        into: Picture and mirrors' weights, see `Shown.add`; only where kernels are in vectors.
 
     Returns:
         Linear RGB radiance, vec3 [layer.pixels.count]: the layer's own where it has one (maps), else that of its hits.
@@ -565,17 +570,16 @@ def seen_radiance(
     pixels = layer.pixels
     looks = prepare_looks(scene, gbuffer, layer, threads)
     normals = prepare_normals(scene, gbuffer, layer, threads)
-    radiance = wp.empty(pixels.count, dtype=wp.vec3, device=scene.device)
     if vector.chosen(kernels, scene.device):
         from warp_reflect import shade_vector  # which shades with this module's structures
 
         areas = summed_late(scene, shadows)
         direct, sky = arriving(scene, gbuffer, layer, normals, threads, shadows, len(areas) > 0, kernels)
         light = [scene.lights, areas, looks, normals, direct, sky, SHARP_ROUGHNESS, ROUGH_ROUGHNESS]
-        shade_vector.shade_rays(scene, gbuffer, layer, light, radiance, threads)
-        return radiance
+        return shade_vector.shade_rays(scene, gbuffer, layer, light, threads, into)
     direct, sky = arriving(scene, gbuffer, layer, normals, threads, shadows, kernels=kernels)
     inputs = [scene.view, scene.lights, looks, normals, direct, sky, pixels.direction, layer.triangle, layer.u, layer.v]
+    radiance = wp.empty(pixels.count, dtype=wp.vec3, device=scene.device)
     launch.launch(seen_radiance_kernel, pixels.count, [*inputs, radiance], scene.device, threads)
     return radiance
 
@@ -599,7 +603,11 @@ def look(
         kernels: `Settings.kernels`.
     """
     looks, normals = prepare_looks(scene, gbuffer, None, threads), prepare_normals(scene, gbuffer, None, threads, bumpy)
-    return Shown(gbuffer, looks, normals, lambda layer: seen_radiance(scene, gbuffer, layer, threads, shadows, kernels))
+
+    def seen(layer: ReflectionLayer, into: tuple[wp.array, wp.array] | None = None) -> wp.array:
+        return seen_radiance(scene, gbuffer, layer, threads, shadows, kernels, into)
+
+    return Shown(gbuffer, looks, normals, seen, seen if vector.chosen(kernels, scene.device) else None)
 
 
 def shade(
@@ -649,7 +657,12 @@ def shade(
         inputs += [gbuffer.reflector_id, picture, mirror]
         launch.launch(shade_kernel, count, inputs, device, threads)
     for layer in undivided(layers.values()):
-        radiance = shown.seen(layer)
+        if finish is None and shown.add is not None:
+            radiance = shown.add(layer, (picture, mirror))
+            if not len(radiance):
+                continue
+        else:
+            radiance = shown.seen(layer)
         if finish is not None:
             radiance = finish(shown, layer, radiance)
         term = [layer.pixels.pixel, radiance, picture, mirror]

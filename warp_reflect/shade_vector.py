@@ -25,11 +25,51 @@ EYE_BLOCKS = 4  # blocks of pixels a task: what does not change along them (ligh
 RAY_BLOCKS = 4  # blocks of rays a task, where all of them are split over threads just the same
 HITS_SPLIT_MIN = 16  # blocks of rays; those of a few pixels meet triangles all over the scene, at 8 us a block
 
+# After `vector.snippet`'s head, in functions that have `pixel`, `out_picture` and `out_mirror`.
+TERMS = r"""
+    float* picture = (float*)out_picture.data;
+    float* mirrors = (float*)out_mirror.data;
+    // Mirror pixels from `start` on whose rays see `radiance`: as many as there are lanes, or those before `end`.
+    auto add_term = [&](int start, int end, V radiance) {
+        const bool full = start + LANES <= end;
+        const int first = pixel.data[start];
+        // Mostly side by side in a row.
+        if (full && !bits(iload(pixel.data + start) != first + lanes())) {
+            const V term = product(vload(mirrors, first), radiance);
+            float rows[4 * LANES];
+            vstore4(rows, 0, term, F(0.0f));
+            vstore(mirrors, first, term);
+            for (int k = 0; k < 4 * LANES; k += LANES)
+                store(picture + 4 * first + k, load(picture + 4 * first + k) + load(rows + k));
+            return;
+        }
+        float seen[3 * LANES];
+        vstore(seen, 0, radiance);
+        for (int i = start; i < (full ? start + LANES : end); ++i) {
+            const int p = pixel.data[i];
+            for (int c = 0; c < 3; ++c) {
+                const float term = mirrors[3 * p + c] * seen[3 * (i - start) + c];
+                mirrors[3 * p + c] = term;
+                picture[4 * p + c] += term;
+            }
+        }
+    };
+    // What that will change, while other pixels are shaded.
+    constexpr int AHEAD = 2 * LANES;
+    auto fetch_term = [&](int start) {
+        const int first = pixel.data[start];
+        for (int word = 0; word < 3 * LANES; word += 16) __builtin_prefetch(mirrors + 3 * first + word, 1);
+        for (int word = 0; word < 4 * LANES; word += 16) __builtin_prefetch(picture + 4 * first + word, 1);
+    };
+    (void)fetch_term;
+"""
+
 
 @wp.func_native(
     vector.snippet(
         SPHERES
         + HITS
+        + TERMS
         + r"""
     const float pi = 3.14159265358979f;
     const int count = triangle.shape[0];
@@ -81,10 +121,10 @@ HITS_SPLIT_MIN = 16  # blocks of rays; those of a few pixels meet triangles all 
     static_assert(look_words == 18, "a look is what is read here");
     const float* table = looked_up ? (const float*)looks.data : (const float*)materials;
     const bool have_colors = scene.color_index.shape[0] > 0 && !looked_up;
-    float* picture = (float*)out_picture.data;
-    float* mirrors = (float*)out_mirror.data;
     float* radiance = (float*)out_radiance.data;
+    const bool adds = pixel.shape[0] > 0;
     for (int start = begin; start < end; start += LANES) {
+        if (adds && start + AHEAD < count) fetch_term(start + AHEAD);
         const I element = start + lanes();
         const I own = ipick(element < end, element, I(end - 1));
         const bool full = start + LANES <= end;
@@ -253,7 +293,9 @@ HITS_SPLIT_MIN = 16  # blocks of rays; those of a few pixels meet triangles all 
         }
         const V weight = vpick(reflector, mirror, same(0.0f));
         const F covered = pick(seen, F(1.0f), F(0.0f));
-        if (of_eye == 0 && full) {
+        if (adds) {
+            add_term(start, end, base);
+        } else if (of_eye == 0 && full) {
             vstore(radiance, start, base);
         } else if (full) {
             vstore4(picture, start, base, covered);
@@ -292,6 +334,7 @@ def shade_block(
     direction: wp.array(dtype=wp.vec3),
     weight_u: wp.array(dtype=float),
     weight_v: wp.array(dtype=float),
+    pixel: wp.array(dtype=int),
     out_picture: wp.array(dtype=wp.vec4),
     out_mirror: wp.array(dtype=wp.vec3),
     out_radiance: wp.array(dtype=wp.vec3),
@@ -319,12 +362,16 @@ def shade_blocks_kernel(
     direction: wp.array(dtype=wp.vec3),
     weight_u: wp.array(dtype=float),
     weight_v: wp.array(dtype=float),
+    pixel: wp.array(dtype=int),
     # Outputs:
     out_picture: wp.array(dtype=wp.vec4),
     out_mirror: wp.array(dtype=wp.vec3),
     out_radiance: wp.array(dtype=wp.vec3),
 ):
-    """One thread per some blocks of pixels that the eye sees, or of rays, whose arrays are then those of length 0."""
+    """One thread per some blocks of pixels that the eye sees, or of rays, whose arrays are then those of length 0.
+
+    What rays see goes into the picture where their pixels are told.
+    """
     shade_block(
         first + wp.tid(),
         blocks,
@@ -345,6 +392,7 @@ def shade_blocks_kernel(
         direction,
         weight_u,
         weight_v,
+        pixel,
         out_picture,
         out_mirror,
         out_radiance,
@@ -358,7 +406,7 @@ def shade_eye(scene: Scene, gbuffer: GBuffer, light: list, picture: wp.array, mi
         light: Light, spheres to sum, looks, normals, direct irradiance, share of the sky, the two roughnesses.
     """
     device = scene.device
-    rays = [none(wp.vec3, device), none(float, device), none(float, device)]
+    rays = [none(wp.vec3, device), none(float, device), none(float, device), none(int, device)]
     inputs = [
         EYE_BLOCKS,
         1,
@@ -375,11 +423,19 @@ def shade_eye(scene: Scene, gbuffer: GBuffer, light: list, picture: wp.array, mi
 
 
 def shade_rays(
-    scene: Scene, gbuffer: GBuffer, layer: ReflectionLayer, light: list, radiance: wp.array, threads: int
-) -> None:
-    """What `shade.seen_radiance_kernel` does; `light` as in `shade_eye`."""
-    device = scene.device
-    rays = [layer.pixels.direction, layer.u, layer.v]
+    scene: Scene, gbuffer: GBuffer, layer: ReflectionLayer, light: list, threads: int, into: tuple | None = None
+) -> wp.array:
+    """What `shade.seen_radiance_kernel` does; `light` as in `shade_eye`.
+
+    Args:
+        into: Picture and mirrors' weights, to which `shade.mirror_term_kernel` adds; None: it is left to the caller.
+
+    Returns:
+        Radiance, vec3 [layer.pixels.count]; of length 0 where it went into a picture.
+    """
+    device, pixels = scene.device, layer.pixels
+    radiance = none(wp.vec3, device) if into else wp.empty(pixels.count, dtype=wp.vec3, device=device)
+    rays = [pixels.direction, layer.u, layer.v, pixels.pixel if into else none(int, device)]
     inputs = [
         RAY_BLOCKS,
         0,
@@ -391,41 +447,26 @@ def shade_rays(
         none(int, device),
         *rays,
     ]
-    inputs += [none(wp.vec4, device), none(wp.vec3, device), radiance]
-    vector.launch_blocks(shade_blocks_kernel, layer.pixels.count, inputs, device, threads, RAY_BLOCKS, HITS_SPLIT_MIN)
+    inputs += [*(into or (none(wp.vec4, device), none(wp.vec3, device))), radiance]
+    vector.launch_blocks(shade_blocks_kernel, pixels.count, inputs, device, threads, RAY_BLOCKS, HITS_SPLIT_MIN)
+    return radiance
 
 
 @wp.func_native(
-    vector.snippet(r"""
+    vector.snippet(
+        TERMS
+        + r"""
     const int count = pixel.shape[0];
     const int begin = block * BLOCK;
     const int end = begin + BLOCK < count ? begin + BLOCK : count;
-    const float* seen = (const float*)radiance.data;
-    float* picture = (float*)out_picture.data;
-    float* mirror = (float*)out_mirror.data;
     for (int start = begin; start < end; start += LANES) {
-        const int first = pixel.data[start];
-        // Mostly side by side in a row.
-        if (start + LANES <= end && !bits(iload(pixel.data + start) != first + lanes())) {
-            const V term = product(vload(mirror, first), vload(seen, start));
-            float rows[4 * LANES];
-            vstore4(rows, 0, term, F(0.0f));
-            vstore(mirror, first, term);
-            for (int k = 0; k < 4 * LANES; k += LANES)
-                store(picture + 4 * first + k, load(picture + 4 * first + k) + load(rows + k));
-            continue;
-        }
-        const int stop = start + LANES < end ? start + LANES : end;
-        for (int i = start; i < stop; ++i) {
-            const int p = pixel.data[i];
-            for (int c = 0; c < 3; ++c) {
-                const float term = mirror[3 * p + c] * seen[3 * i + c];
-                mirror[3 * p + c] = term;
-                picture[4 * p + c] += term;
-            }
-        }
+        const I element = start + lanes();
+        const bool full = start + LANES <= end;
+        const V seen = vrows((const float*)radiance.data, start, full, ipick(element < end, element, I(end - 1)));
+        add_term(start, end, seen);
     }
-""")
+"""
+    )
 )
 def mirror_term_block(
     block: int,
