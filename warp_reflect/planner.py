@@ -647,20 +647,25 @@ def _tried(
     """(What is tried of what the camera sees, where lights or bounces are decided by that; the lights).
 
     A quarter of the points is enough where every light clearly casts shadows and every mirror shows a mirror; not of shapes,
-    the cost of whose shadows hangs on how far their penumbras reach. Where no light is tried, points cost less than trying twice.
+    the cost of whose shadows hangs on how far their penumbras reach. Where mirrors alone are in doubt, light is not tried again.
     """
     clear = [k for k in mirrors if pixels[k] >= max(settings.few_pixels, 1)]
     facing = settings.bounces > 1 and (len(mirrors) > 1 or any(not scene.body(k).convex for k in clear))
-    if seen is None or not (needs_probe(scene, settings) or facing):
-        return None, plan_lights(scene, None, settings, costs)
     casting = needs_probe(scene, settings)
-    at_once = not casting or any(light.kind in AREA_KINDS for light in scene.data.lights)
-    for spacing in (1,) if at_once else (2, 1):
-        tried = probe(scene, seen, settings.threads, spacing, casting)
+    if seen is None or not (casting or facing):
+        return None, plan_lights(scene, None, settings, costs)
+    if not casting:  # points cost less than trying twice
+        tried = probe(scene, seen, settings.threads, 1, False)
+        return tried, plan_lights(scene, tried, settings, costs)
+    if not any(light.kind in AREA_KINDS for light in scene.data.lights):
+        tried = probe(scene, seen, settings.threads, 2, True)
         lights = plan_lights(scene, tried, settings, costs)
-        if are_clear(lights, settings) and (not facing or all(tried.mirrored.values())):
-            break
-    return tried, lights
+        if are_clear(lights, settings):
+            if facing and not all(tried.mirrored.values()):
+                tried = probe(scene, seen, settings.threads, 1, False)
+            return tried, lights
+    tried = probe(scene, seen, settings.threads, 1, True)
+    return tried, plan_lights(scene, tried, settings, costs)
 
 
 def _fit(made: Plan, pace: choice.Pace, keep: Plan | None = None) -> None:
