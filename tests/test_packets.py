@@ -471,6 +471,30 @@ def test_shadows_are_found_bit_for_bit_as_the_plain_kernels_find_them(samples):
         np.testing.assert_array_equal(got, sky)
 
 
+@pytest.mark.parametrize("size", [(96, 64), (90, 50)])
+@pytest.mark.parametrize("order", ["rows", "two lists", "any"])
+def test_shadows_of_some_pixels_are_those_of_plain_kernels_in_whatever_order_they_are_listed(size, order):
+    """In tiles of a picture, or not; points of a row that stand in two lists, or anywhere, do not follow each other."""
+    scene, camera = lit_balls()
+    gbuffer = raster.draw_scene(scene, look_at(camera.eye, (0, 0.6, 0), fov=50, size=size))
+    rng = np.random.default_rng(4)
+    some = np.flatnonzero(rng.random(size[0] * size[1]) < 0.7).astype(np.int32)
+    if order == "two lists":
+        second = rng.random(len(some)) < 0.4
+        some = np.concatenate([some[~second], some[second]])
+    elif order == "any":
+        some = rng.permutation(some)
+    points = direct.points_of(scene, gbuffer, chosen=some)
+    every = shadows.every_shadow(scene, 16)
+    for shared in (False, True):
+        cast = shadows.Shadows(every.distant, every.areas, samples=16, shared=shared)
+        plain = shadows.shadowed_irradiance(scene, points, cast, 1, kernels="plain").numpy()
+        assert plain.any()
+        for threads in (1, 2, 8):
+            got = shadows.shadowed_irradiance(scene, points, cast, threads, kernels="vector").numpy()
+            np.testing.assert_array_equal(got, plain)
+
+
 def test_lights_are_tried_one_by_one_bit_for_bit_as_the_plain_kernel_tries_them():
     scene, _ = lit_balls()
     camera = look_at((0, 1.0, 4.0), (0, 0.8, 0), fov=60, size=(67, 43))

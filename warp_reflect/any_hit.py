@@ -118,10 +118,12 @@ ANY_HIT = (
         // Of each ray alone: where it starts on its own axes; how it turns, and its reach.
         float starts_at[4 * BLOCK], turns_by[4 * BLOCK];
         bool listed = false;
+        bool endless = false;
         for (int g = 0; g < GROUPS; ++g) {
             left[g] = bits(live[g]);
             ray[g] = way_of(o[g], d[g]);
             octant[g] = octant_of(d[g]);
+            endless |= bits(live[g] & (reach[g] > 1.0e38f)) != 0;
         }
         // A chunk's triangles and as many rays as go abreast: a bit for each of those that meet one of `met`.
         auto chunk_blocks = [&](const float* corners, const Axes& axes, const int* of, int count, unsigned met) -> unsigned {
@@ -147,26 +149,22 @@ ANY_HIT = (
                 spread_out(turn, I(2)), marked(asked), best));
         };
         while (true) {
-            // Rays of one octant at a time.
-            Rays open = 0;
+            // Rays to a light all at once; of those that end nowhere those of one octant at a time.
+            Rays open = 0, down_x = 0, down_y = 0, down_z = 0, zeros = 0;
             int signs = -1;
-            Axes axes{true, 0, 0, 0};
-            bool no_zeros = true;
             V starts_low = same(3.0e38f), starts_high = same(-3.0e38f), ends_low = same(3.0e38f), ends_high = same(-3.0e38f);
             for (int g = 0; g < GROUPS; ++g) {
                 if (!left[g]) continue;
                 const Way& r = ray[g];
-                if (signs < 0) {
-                    const int lead = __builtin_ctz(left[g]);
-                    signs = octant[g][lead];
-                    axes.x = r.kx[lead]; axes.y = r.ky[lead]; axes.z = r.kz[lead];
-                }
-                const I own = marked(left[g]) & (octant[g] == signs);
-                if (!bits(own)) continue;
-                open |= (Rays)bits(own) << g * LANES;
-                left[g] &= ~bits(own);
-                axes.one &= !bits(own & ((r.kz != axes.z) | (r.kx != axes.x)));
-                no_zeros &= !bits(own & (r.zero_x | r.zero_y | r.zero_z));
+                if (signs < 0) signs = octant[g][__builtin_ctz(left[g])];
+                const I own = endless ? marked(left[g]) & (octant[g] == signs) : marked(left[g]);
+                const unsigned some = bits(own);
+                if (!some) continue;
+                auto put = [&](Rays& all, I which) { all |= (Rays)(bits(which) & some) << g * LANES; };
+                put(open, own);
+                put(down_x, r.inverse.x < 0.0f); put(down_y, r.inverse.y < 0.0f); put(down_z, r.inverse.z < 0.0f);
+                put(zeros, r.zero_x | r.zero_y | r.zero_z);
+                left[g] &= ~some;
                 // Beyond the scene nothing is met.
                 const F last = 4.0f * fmax(size(o[g]), F(scene_width)) / size(d[g]);
                 const V end = add(o[g], times(fmin(reach[g], last), d[g]));
@@ -180,8 +178,42 @@ ANY_HIT = (
             }
             if (signs < 0) break;
             const Rays all = open;
+            // Rays whose triangles' tests turn the axes alike.
+            Rays alike[6];
+            Axes axes[6];
+            int kinds = 0;
+            for (Rays rest = all; rest != 0; ++kinds) {
+                const int lead = __builtin_ctzll(rest), of = lead / LANES, l = lead % LANES;
+                axes[kinds] = Axes{true, ray[of].kx[l], ray[of].ky[l], ray[of].kz[l]};
+                alike[kinds] = 0;
+                for (int g = 0; g < GROUPS; ++g) {
+                    const unsigned own = bits((ray[g].kz == axes[kinds].z) & (ray[g].kx == axes[kinds].x));
+                    alike[kinds] |= rest & (Rays)own << g * LANES;
+                }
+                rest &= ~alike[kinds];
+            }
+            auto box_asked = [&](int g, const float* of) -> I {
+                const Way& r = ray[g];
+                F enter = F(-3.402823466e38f), leave = F(3.402823466e38f);
+                if (zeros) {
+                    slab(of[0], of[24], r.o.x, r.inverse.x, r.zero_x, enter, leave);
+                    slab(of[8], of[32], r.o.y, r.inverse.y, r.zero_y, enter, leave);
+                    slab(of[16], of[40], r.o.z, r.inverse.z, r.zero_z, enter, leave);
+                } else {
+                    auto between = [&](Rays down, int row, F from, F inverse) {
+                        const F in = (of[down == all ? row + 24 : row] - from) * inverse;
+                        const F out = (of[down == all ? row : row + 24] - from) * inverse;
+                        const bool mixed = down != 0 && down != all;
+                        enter = fmax(mixed ? fmin(in, out) : in, enter);
+                        leave = fmin(mixed ? fmax(in, out) : out, leave);
+                    };
+                    between(down_x, 0, r.o.x, r.inverse.x);
+                    between(down_y, 8, r.o.y, r.inverse.y);
+                    between(down_z, 16, r.o.z, r.inverse.z);
+                }
+                return (leave >= 0.0f) & (leave >= enter) & (enter < reach[g]);
+            };
             const Shaft shaft = shaft_of(starts_low, starts_high, ends_low, ends_high);
-            const Bundle by{(signs & 1) != 0, (signs & 2) != 0, (signs & 4) != 0, no_zeros};
             Waiting waiting[DEEPEST];
             int waiting_count = 0, node = 0;
             Rays rays = open;
@@ -199,7 +231,7 @@ ANY_HIT = (
                     fetch(child);
                     Rays met = 0;
                     for (int k = 0; k < some_count; ++k)
-                        met |= (Rays)bits(box_met(by, ray[some[k]], reach[some[k]], boxes + slot)) << some[k] * LANES;
+                        met |= (Rays)bits(box_asked(some[k], boxes + slot)) << some[k] * LANES;
                     met &= rays;
                     waiting[waiting_count] = Waiting{child, met};
                     waiting_count += met != 0;
@@ -212,42 +244,45 @@ ANY_HIT = (
                     if (child >= 0) { node = child; break; }
                     for (int chunk = ~child;; ++chunk) {
                         const float* corners = tree_chunks + 48 * chunk;
-                        unsigned met = four_within(shaft, corners);
-                        if (met) {
-                            int single[BLOCK + ABREAST], count = 0, vector_count = 0;
-                            for (Rays own = rays; own != 0; own &= own - 1) single[count++] = __builtin_ctzll(own);
-                            EACH_GROUP vector_count += part_of(rays, g) != 0;
-                            if (axes.one && count <= ABREAST * vector_count * __builtin_popcount(met)) {
-                                if (!listed) {
-                                    for (int g = 0; g < GROUPS; ++g) {
-                                        const Way& r = ray[g];
-                                        vstore4(starts_at, g * LANES, V{r.ox, r.oy, r.oz}, F(0.0f));
-                                        vstore4(turns_by, g * LANES, V{r.sx, r.sy, r.sz}, reach[g]);
+                        const unsigned met = four_within(shaft, corners);
+                        for (int kind = 0; met != 0 && kind < kinds; ++kind) {
+                            const Rays own = rays & alike[kind];
+                            if (!own) continue;
+                            int vectors = 0;
+                            EACH_GROUP vectors += part_of(own, g) != 0;
+                            if (__builtin_popcountll(own) > ABREAST * vectors * __builtin_popcount(met)) {
+                                for (unsigned left = met; left != 0; left &= left - 1) {
+                                    const float* a = corners + __builtin_ctz(left);
+                                    EACH_GROUP {
+                                        const unsigned asked = part_of(rays & own, g);
+                                        if (!asked) continue;
+                                        Met best{I(-1), reach[g], F(0.0f), F(0.0f)};
+                                        const unsigned hits = bits(meet_triangle(Any{}, Chunk{}, 0, a, a + 12, a + 24, axes[kind],
+                                            ray[g], marked(asked), best));
+                                        rays &= ~((Rays)hits << g * LANES);
                                     }
-                                    listed = true;
                                 }
-                                for (int k = count; k % ABREAST != 0; ++k) single[k] = single[count - 1];
-                                for (int k = 0; k < count; k += ABREAST) {
-                                    const int together = count - k < ABREAST ? count - k : ABREAST;
-                                    unsigned hits = chunk_blocks(corners, axes, single + k, together, met);
-                                    // Of each ray's four triangles one is enough.
-                                    hits |= hits >> 2;
-                                    hits |= hits >> 1;
-                                    for (hits &= 0x1111u; hits != 0; hits &= hits - 1)
-                                        rays &= ~((Rays)1 << single[k + __builtin_ctz(hits) / 4]);
-                                }
-                                met = 0;
+                                continue;
                             }
-                        }
-                        for (; met != 0; met &= met - 1) {
-                            const float* a = corners + __builtin_ctz(met);
-                            EACH_GROUP {
-                                const unsigned asked = part_of(rays, g);
-                                if (!asked) continue;
-                                Met best{I(-1), reach[g], F(0.0f), F(0.0f)};
-                                const unsigned hits = bits(
-                                    meet_triangle(Any{}, Chunk{}, 0, a, a + 12, a + 24, axes, ray[g], marked(asked), best));
-                                rays &= ~((Rays)hits << g * LANES);
+                            if (!listed) {
+                                for (int g = 0; g < GROUPS; ++g) {
+                                    const Way& r = ray[g];
+                                    vstore4(starts_at, g * LANES, V{r.ox, r.oy, r.oz}, F(0.0f));
+                                    vstore4(turns_by, g * LANES, V{r.sx, r.sy, r.sz}, reach[g]);
+                                }
+                                listed = true;
+                            }
+                            int single[BLOCK + ABREAST], count = 0;
+                            for (Rays rest = own; rest != 0; rest &= rest - 1) single[count++] = __builtin_ctzll(rest);
+                            for (int k = count; k % ABREAST != 0; ++k) single[k] = single[count - 1];
+                            for (int k = 0; k < count; k += ABREAST) {
+                                const int together = count - k < ABREAST ? count - k : ABREAST;
+                                unsigned hits = chunk_blocks(corners, axes[kind], single + k, together, met);
+                                // Of each ray's four triangles one is enough.
+                                hits |= hits >> 2;
+                                hits |= hits >> 1;
+                                for (hits &= 0x1111u; hits != 0; hits &= hits - 1)
+                                    rays &= ~((Rays)1 << single[k + __builtin_ctz(hits) / 4]);
                             }
                         }
                         if (!((const int*)corners)[40]) break;

@@ -1,7 +1,7 @@
 """The rays of `shadows.py`'s kernels for a block of points at a time.
 
-The same rays, to the last bit, in packets (`any_hit.py`): those of neighbouring points towards the same sample, or a point's
-own samples.
+The same rays, to the last bit, in packets (`any_hit.py`): those of points of a tile of the picture, sorted by the parts of a
+light that they are sent to where points lie closer together than what shines is wide.
 """
 
 from __future__ import annotations
@@ -43,21 +43,38 @@ CODES += [SAME_TURN, FLATNESS, LEAST_COUNT, SHARP, LEAST_SPREAD, STEEP, TILE]
     vector.snippet(
         ANY_HIT
         + r"""
-    // The first points of a block's vectors: in a picture of whole tiles they lie below each other, not in a row.
+    // A block's points. In a picture of whole tiles they are those of a tile, a row a vector, else they follow each other.
     const int image_width = around.width;
-    const bool tiled = around.pixel.shape[0] == 0 && image_width > 0 && image_width % tile == 0
-        && count % image_width == 0 && count / image_width % (tile / 2) == 0;
-    int first_of[BLOCK / LANES];
-    for (int v = 0; v < BLOCK / LANES; ++v) {
-        const int across = tiled ? image_width / LANES : 1;
-        first_of[v] = block * BLOCK + v * LANES;
-        if (tiled) first_of[v] = (block / across * (BLOCK / LANES) + v) * image_width + block % across * LANES;
-    }
-    const int end = count;
-    const float* rows = starts.rows.data;
+    const bool listed = around.pixel.shape[0] > 0;
+    const int pictured_count = listed ? around.index.shape[0] : count;
+    const bool tiled = image_width > 0 && image_width % tile == 0 && pictured_count > 0 && pictured_count % image_width == 0
+        && pictured_count / image_width % (tile / 2) == 0;
     const int stride = starts.rows.shape[1];
-    auto point_of = [&](int j) -> int { return first_of[j / LANES] + j % LANES; };
-    auto points_of = [&](I j) -> I { return igather(first_of, j / LANES) + j % LANES; };
+    int own_of[BLOCK], count_of[GROUPS];
+    bool beside[GROUPS];
+    for (int v = 0; v < GROUPS; ++v) {
+        const int across = tiled ? image_width / LANES : 1;
+        int first = block * BLOCK + v * LANES;
+        if (tiled) first = (block / across * GROUPS + v) * image_width + block % across * LANES;
+        I own = first + lanes();
+        count_of[v] = first + LANES <= count ? LANES : first < count ? count - first : 0;
+        if (tiled && listed) {
+            const I index = iload(around.index.data + first);
+            count_of[v] = 0;
+            for (unsigned left = bits(~(index < 0)); left != 0; left &= left - 1)
+                own_of[v * LANES + count_of[v]++] = index[__builtin_ctz(left)];
+            for (int l = count_of[v]; l < LANES; ++l) own_of[v * LANES + l] = count_of[v] > 0 ? own_of[v * LANES + l - 1] : 0;
+            own = iload(own_of + v * LANES);
+        }
+        const I there = lanes() < count_of[v];
+        beside[v] = own[0] + LANES <= stride && !bits(there & (own != own[0] + lanes()));
+        istore(own_of + v * LANES, ipick(there, own, I(count_of[v] > 0 ? own[0] : 0)));
+    }
+    const float* rows = starts.rows.data;
+    // Of all points of a vector.
+    auto values = [&](const float* of, int v) -> F {
+        return beside[v] ? load(of + own_of[v * LANES]) : gather(of, iload(own_of + v * LANES));
+    };
     auto root = [](F a) -> F { return __builtin_elementwise_sqrt(a); };
     auto below = [](F a) -> F { return a - __builtin_elementwise_floor(a); };
     // shadows.sample_place
@@ -141,7 +158,7 @@ CODES += [SAME_TURN, FLATNESS, LEAST_COUNT, SHARP, LEAST_SPREAD, STEEP, TILE]
     // Almost all points ask distant lights: where those of the next block start is on its way while these go. A picture's tiles
     // are too many rows for the processor to see that coming.
     for (int v = 0; v < GROUPS && lights.distant.shape[0] > 0; ++v) {
-        const float* next = rows + first_of[v] + (tiled ? LANES : BLOCK);
+        const float* next = rows + own_of[v * LANES] + (tiled ? LANES : BLOCK);
         for (int r = 0; r < 6; ++r) __builtin_prefetch(next + r * stride);
     }
     // A light: a distant one, else a shape, or the sky.
@@ -158,16 +175,15 @@ CODES += [SAME_TURN, FLATNESS, LEAST_COUNT, SHARP, LEAST_SPREAD, STEEP, TILE]
     // Where vectors of points lie in the pictures of what rays find (shadow_neighbours.place_of); most lie side by side in a row.
     typedef unsigned char Entries __attribute__((ext_vector_type(LANES)));
     const int line = around.width + 2 * neighbours;
-    const bool pictured = sharing || to_all || only_first, listed = around.pixel.shape[0] > 0;
+    const bool pictured = sharing || to_all || only_first;
     int number[BLOCK], place[BLOCK];
     bool straight[GROUPS];
     for (int v = 0; pictured && v < GROUPS; ++v) {
-        const int start = first_of[v];
-        if (start >= end) break;
-        const I own = start + lanes() < end ? start + lanes() : I(end - 1);
+        if (count_of[v] == 0) continue;
+        const I own = iload(own_of + v * LANES);
         const I pixel = listed ? igather(around.pixel.data, own) : own;
         const int row = pixel[0] / around.width;
-        straight[v] = start + LANES <= end && (row + 1) * around.width - pixel[0] >= LANES && !bits(pixel != pixel[0] + lanes());
+        straight[v] = count_of[v] == LANES && (row + 1) * around.width - pixel[0] >= LANES && !bits(pixel != pixel[0] + lanes());
         const I rows_before = straight[v] ? I(row) : pixel / around.width;
         istore(number + v * LANES, pixel);
         istore(place + v * LANES, pixel + 2 * neighbours * rows_before + neighbours * line + neighbours);
@@ -188,13 +204,13 @@ CODES += [SAME_TURN, FLATNESS, LEAST_COUNT, SHARP, LEAST_SPREAD, STEEP, TILE]
     };
     // shadow_neighbours.shared_share of a vector of points, lanes `asked` of it.
     auto shared_shares = [&](const unsigned char* shared, const float* unshadowed, int v, I asked) -> F {
-        const int start = first_of[v];
-        auto own_row = [&](int r) -> F { return load(rows + r * stride + start); };
+        auto own_row = [&](int r) -> F { return values(rows + r * stride, v); };
         const V p = V{own_row(0), own_row(1), own_row(2)}, side = V{own_row(6), own_row(7), own_row(8)};
-        const I here = start + lanes(), pixel = iload(number + v * LANES);
+        const I here = iload(own_of + v * LANES), pixel = iload(number + v * LANES);
         I known = I(0), total = I(0), squares = I(0);
         I sum_x = I(0), sum_y = I(0), square_x = I(0), along_x = I(0), along_y = I(0);
         F brought = F(0.0f), arrived = F(0.0f);
+        const F flat = F(flatness * flatness), same_side = F(same_turn);
         for (int y = -neighbours; y <= neighbours; ++y) {
             for (int x = -neighbours; x <= neighbours; ++x) {
                 const I entry = numbers(entries(shared, v, y * line + x));
@@ -212,7 +228,7 @@ CODES += [SAME_TURN, FLATNESS, LEAST_COUNT, SHARP, LEAST_SPREAD, STEEP, TILE]
                 const V away = sub(V{row(0), row(1), row(2)}, p);
                 const F beside = dot(side, away);
                 const F turned = dot(side, V{row(6), row(7), row(8)});
-                const I near = there & (beside * beside <= flatness * flatness * dot(away, away)) & (turned >= same_turn);
+                const I near = there & (beside * beside <= flat * dot(away, away)) & (turned >= same_side);
                 if (!bits(near)) continue;
                 const I level = near & entry >> 2;
                 known -= near;
@@ -249,17 +265,17 @@ CODES += [SAME_TURN, FLATNESS, LEAST_COUNT, SHARP, LEAST_SPREAD, STEEP, TILE]
         // What would arrive unshadowed, `before`, and which points have to ask.
         int asking_count = 0;
         unsigned marks[GROUPS] = {};
-        for (int v = 0; v < GROUPS && first_of[v] < end; ++v) {
-            const int start = first_of[v];
-            auto row = [&](int r) -> F { return load(rows + r * stride + start); };
-            const I there = start + lanes() < end;
+        for (int v = 0; v < GROUPS; ++v) {
+            if (count_of[v] == 0) continue;
+            auto row = [&](int r) -> F { return values(rows + r * stride, v); };
+            const I there = lanes() < count_of[v];
             I asks;
             F of_what = F(1.0f), arrives = F(1.0f);
             if (to_sky) {
                 asks = there & ((row(3) != 0.0f) | (row(4) != 0.0f) | (row(5) != 0.0f));
             } else {
                 if (distant) of_what = dot(V{row(3), row(4), row(5)}, spread(lights.distant.data[light].to_light));
-                else of_what = load(starts.unshadowed.data + k * stride + start);
+                else of_what = values(starts.unshadowed.data + k * stride, v);
                 asks = there & (of_what > 0.0f);
                 if (!casts) asks = I(0);
                 if (!distant && bits(asks) && (sharing || to_all)) {
@@ -269,7 +285,14 @@ CODES += [SAME_TURN, FLATNESS, LEAST_COUNT, SHARP, LEAST_SPREAD, STEEP, TILE]
                     const I settled = asks & (together != (lit | dark));
                     store(known + v * LANES, __builtin_convertvector(numbers(entry) >> 2, F) / (float)levels);
                     asks &= ~settled;
-                    if (sharing && bits(settled)) {
+                    if (sharing && straight[v]) {
+                        unsigned char* own = shared + place[v * LANES];
+                        const Entries kept = __builtin_convertvector(settled, Entries);
+                        Entries all;
+                        __builtin_memcpy(&all, own, sizeof(all));
+                        all = (entry & kept) | (all & ~kept);
+                        __builtin_memcpy(own, &all, sizeof(all));
+                    } else if (sharing) {
                         for (unsigned left = bits(settled); left != 0; left &= left - 1) {
                             const int l = __builtin_ctz(left);
                             shared[place[v * LANES + l]] = entry[l];
@@ -300,7 +323,7 @@ CODES += [SAME_TURN, FLATNESS, LEAST_COUNT, SHARP, LEAST_SPREAD, STEEP, TILE]
         int of[RAYS], which[RAYS], order[RAYS];
         for (int v = 0; v * LANES < asking_count; ++v) {
             const I asked = v * LANES + lanes() < asking_count ? iload(asking + v * LANES) : I(asking[0]);
-            const I own = points_of(asked);
+            const I own = igather(own_of, asked);
             I lead;
             EACH_LANE lead[l] = own[l & ~3];
             const bool together = !bits(own - own[0] != lanes()), by_fours = !bits(own - lead != (lanes() & 3));
@@ -459,41 +482,49 @@ CODES += [SAME_TURN, FLATNESS, LEAST_COUNT, SHARP, LEAST_SPREAD, STEEP, TILE]
                 arrived[of[i]] += arrived_by[i];
             }
         }
-        for (int a = 0; a < asking_count; ++a) {
-            const int j = asking[a];
-            if (brought[a] != 0.0f) share[j] = arrived[a] / brought[a];
-            if (to_sky && brought[a] != 0.0f) out_share.data[point_of(j)] = share[j];
-            if (known_count > 0)
-                share[j] = ((float)known_count * known[j] + (float)(ray_count - known_count) * share[j]) / (float)ray_count;
-            if (only_first || sharing) {
-                const int code = share[j] == 1.0f ? lit : share[j] == 0.0f ? dark : lit | dark;
-                const int entry = code | (int)(share[j] * (float)levels + 0.5f) << 2;
-                if (only_first) found[place[j]] = (unsigned char)entry;
-                else shared[place[j]] = (unsigned char)(entry | lit | dark);
+        for (int a = 0; a < asking_count; a += LANES) {
+            const I asked = a + lanes() < asking_count ? iload(asking + a) : I(asking[0]);
+            const F brings = load(brought + a);
+            F found_share = pick(brings != 0.0f, load(arrived + a) / brings, gather(share, asked));
+            if (known_count > 0) {
+                const F first_share = gather(known, asked);
+                found_share = ((float)known_count * first_share + (float)(ray_count - known_count) * found_share)
+                    / (float)ray_count;
+            }
+            I code = ipick(found_share == 0.0f, I(dark), I(lit | dark));
+            code = ipick(found_share == 1.0f, I(lit), code);
+            code |= __builtin_convertvector(found_share * (float)levels + 0.5f, I) << 2;
+            for (int l = 0; l < LANES && a + l < asking_count; ++l) {
+                const int j = asking[a + l];
+                share[j] = found_share[l];
+                if (to_sky && brought[a + l] != 0.0f) out_share.data[own_of[j]] = share[j];
+                if (only_first) found[place[j]] = (unsigned char)code[l];
+                else if (sharing) shared[place[j]] = (unsigned char)(code[l] | lit | dark);
             }
         }
-        for (int j = 0; each && j < BLOCK && point_of(j) < end; ++j) {
-            const float* n = rows + 3 * stride + point_of(j);
+        for (int j = 0; each && j < BLOCK; ++j) {
+            if (j % LANES >= count_of[j / LANES]) continue;
+            const float* n = rows + 3 * stride + own_of[j];
             if (n[0] == 0.0f && n[stride] == 0.0f && n[2 * stride] == 0.0f) continue;
-            out_share.data[point_of(j) * (distant_count + area_count) + light] = share[j];
+            out_share.data[own_of[j] * (distant_count + area_count) + light] = share[j];
         }
         if (!to_all) continue;
         const V color = spread(distant ? lights.distant.data[light].irradiance : lights.areas.data[k].radiance);
-        for (int v = 0; v < GROUPS && first_of[v] < end; ++v) {
+        for (int v = 0; v < GROUPS; ++v) {
+            if (count_of[v] == 0) continue;
             const F of_what = load(before + v * LANES);
             const V sum = add(total[v], times(of_what * load(share + v * LANES), color));
             total[v] = vpick(of_what > 0.0f, sum, total[v]);
         }
     }
-    for (int v = 0; to_all && v < GROUPS && first_of[v] < end; ++v) {
+    for (int v = 0; to_all && v < GROUPS; ++v) {
         float* to = (float*)out_irradiance.data;
-        const int start = first_of[v];
-        if (start + LANES <= end) {
-            vstore(to, start, total[v]);
+        if (count_of[v] == LANES && beside[v]) {
+            vstore(to, own_of[v * LANES], total[v]);
             continue;
         }
-        for (int l = 0; start + l < end; ++l) {
-            float* one = to + 3 * (start + l);
+        for (int l = 0; l < count_of[v]; ++l) {
+            float* one = to + 3 * own_of[v * LANES + l];
             one[0] = total[v].x[l]; one[1] = total[v].y[l]; one[2] = total[v].z[l];
         }
     }
@@ -635,7 +666,7 @@ def irradiance(
         passes = [(FIRST, 0, first), *([(SHARED, first, shared)] if shared else []), *passes]
     for mode, known, sent in passes:
         inputs = [mesh, lights, *cast, starts, count, known, sent, around, mode, *CODES]
-        _launch(count, [*inputs, out_irradiance, none], device, threads)
+        _launch(_block_count(count, around), [*inputs, out_irradiance, none], device, threads)
 
 
 def shares(
@@ -645,7 +676,7 @@ def shares(
     device = out_share.device
     cast = [wp.full(len(kind), 1, dtype=int, device=device) for kind in (lights.distant, lights.areas)]
     inputs = [mesh, lights, *cast, starts, count, 0, samples, Neighbours(), EACH, *CODES]
-    _launch(count, [*inputs, compact.none(wp.vec3, device), out_share], device, threads)
+    _launch(vector.block_count(count), [*inputs, compact.none(wp.vec3, device), out_share], device, threads)
 
 
 def sky_share(mesh: wp.uint64, starts: Starts, count: int, samples: int, out_share: wp.array, threads: int = 0) -> None:
@@ -653,9 +684,19 @@ def sky_share(mesh: wp.uint64, starts: Starts, count: int, samples: int, out_sha
     device = out_share.device
     none = compact.none(int, device)
     inputs = [mesh, DirectView(), none, none, starts, count, 0, samples, Neighbours(), SKY, *CODES]
-    _launch(count, [*inputs, compact.none(wp.vec3, device), out_share], device, threads)
+    _launch(vector.block_count(count), [*inputs, compact.none(wp.vec3, device), out_share], device, threads)
 
 
-def _launch(count: int, inputs: list, device, threads: int) -> None:
+def _block_count(count: int, around: Neighbours) -> int:
+    """Blocks of points: the tiles of a picture of whole ones, wherever points lie in it."""
+    listed = len(around.pixel) if around.width else 0
+    pixels = len(around.index) if listed else count
+    rows = pixels // around.width if around.width else 0
+    if rows and around.width % TILE == 0 and rows % (TILE // 2) == 0 and pixels == rows * around.width:
+        return pixels // vector.BLOCK
+    return vector.block_count(count)
+
+
+def _launch(blocks: int, inputs: list, device, threads: int) -> None:
     # Blocks of rays are worth a second thread sooner than `vector.launch_blocks` thinks.
-    launch(send_blocks_kernel, vector.block_count(count), inputs, device, threads, split_min=BLOCK_SPLIT_MIN)
+    launch(send_blocks_kernel, blocks, inputs, device, threads, split_min=BLOCK_SPLIT_MIN)
