@@ -329,16 +329,10 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
                 if (bits(later)) {
                     const F each[KEPT] = {target.x, target.y, target.z, g.x.x, g.x.y, g.x.z, best.x, best.y, best.z,
                         p.x, p.y, p.z, n.x, n.y, n.z, g.step.x, g.step.y, g.step.z, residual, g.shrink};
-                    float lane[KEPT][LANES];
-                    int count_of[LANES];
-                    for (int k = 0; k < KEPT; ++k) store(lane[k], each[k]);
-                    istore(count_of, g.used);
-                    for (unsigned left = bits(later); left != 0; left &= left - 1) {
-                        const int l = __builtin_ctz(left);
-                        for (int k = 0; k < KEPT; ++k) few[k][few_count] = lane[k][l];
-                        few_used[few_count] = count_of[l];
-                        few_vertex[few_count++] = numbers[start + l];
-                    }
+                    const unsigned marked = bits(later);
+                    for (int k = 0; k < KEPT; ++k) packed((int*)few[k] + few_count, __builtin_bit_cast(I, each[k]), marked);
+                    packed(few_used + few_count, g.used, marked);
+                    few_count += packed(few_vertex + few_count, vertex, marked);
                 }
                 I done = asked & ~later & (residual <= accepted), answer = I(converged);
                 I rest = asked & ~later & ~done, nothing = I(0);
