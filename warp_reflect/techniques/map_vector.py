@@ -1,8 +1,8 @@
 """The Newton search in a reflector map (`map_search.solve_vertex`) for a block of vertices at a time.
 
-The same steps with the same decisions in every lane. Visible vertices of the block are moved together first, and again
-where few of a vector's lanes go on and where searches that did not end near a root start from a coarse seed. The vectors of
-a block take turns at each part of an evaluation: every operation of a search waits for the one before it, those of its
+The same steps with the same decisions in every lane. Visible vertices of a run are moved together first, and again where
+few of a vector's lanes go on and where searches that did not end near a root start from a coarse seed. The vectors of a run
+take turns at each part of an evaluation: every operation of a search waits for the one before it, those of its
 neighbours don't.
 """
 
@@ -52,11 +52,12 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
     const int count = points.shape[0];
     const V white_eye = product(eye, inv_extent);
     const F eye_height = fmax(length(white_eye) - 1.0f, F(1.0e-3f));
-    // What is left to search, side by side, and a vector more for the last load: of a block, then of all blocks.
-    constexpr int FEW = 3, TASK = BLOCKS * BLOCK, FEW_ROW = FEW * TASK / LANES + LANES;
+    // What is left to search, side by side, and a vector more for the last load: of a run, then of all runs.
+    constexpr int ROWS = 8, RUN = ROWS * LANES, TASK = BLOCKS * BLOCK, RUNS = TASK / RUN;
+    constexpr int FEW = 3, FEW_ROW = FEW * TASK / LANES + LANES;
     enum { X = 3, BEST = 6, P = 9, N = 12, STEP = 15, RESIDUAL = 18, SHRINK = 19, KEPT = 20 };
-    float at[X + 3][BLOCK + LANES], few[KEPT][FEW_ROW], far[X + 3][TASK + LANES];
-    int vertex_of[BLOCK + LANES], few_vertex[FEW_ROW], few_used[FEW_ROW], far_vertex[TASK + LANES];
+    float at[X + 3][RUN + LANES], few[KEPT][FEW_ROW], far[X + 3][TASK + LANES];
+    int vertex_of[RUN + LANES], few_vertex[FEW_ROW], few_used[FEW_ROW], far_vertex[TASK + LANES];
     int few_count = 0, far_count = 0;
 // Between what is read and what is written of a row: the compiler would make masked stores of them, which are slow.
 #define KEEP_APART(row) asm volatile("" : : "r"(&row) : "memory");
@@ -69,7 +70,6 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
         Sample s;
         Law law;
     };
-    constexpr int ROWS = BLOCK / LANES;
     Search group[ROWS];
     Search unasked;  // what is known before the first evaluation
     unasked.residual = F(1.0e30f);
@@ -77,13 +77,13 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
     unasked.used = I(0);
     unasked.best = unasked.p = unasked.n = unasked.step = same(0.0f);
     // map_search.search_newton. A vector goes on while more than FEW of its lanes do: the others go on side by side after the
-    // last block, and then those that ended far from a root start again from a coarse seed.
-    for (int round = 0; round < BLOCKS + 2; ++round) {
-        const bool in_few = round == BLOCKS, in_coarse = round == BLOCKS + 1;
+    // last run, and then those that ended far from a root start again from a coarse seed.
+    for (int round = 0; round < RUNS + 2; ++round) {
+        const bool in_few = round == RUNS, in_coarse = round == RUNS + 1;
         int searched = in_few ? few_count : in_coarse ? far_count : 0;
-        if (round < BLOCKS) {
-            const int begin = (task * BLOCKS + round) * BLOCK;
-            const int end = begin + BLOCK < count ? begin + BLOCK : count;
+        if (round < RUNS) {
+            const int begin = task * TASK + round * RUN;
+            const int end = begin + RUN < count ? begin + RUN : count;
             for (int start = begin; start < end; start += LANES) {
                 const bool full = end - start >= LANES;
                 const I element = start + lanes();
@@ -164,7 +164,7 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
         if (searched == 0) continue;
         float* rows = in_few ? few[0] : in_coarse ? far[0] : at[0];
         int* numbers = in_few ? few_vertex : in_coarse ? far_vertex : vertex_of;
-        const int ROW = in_few ? FEW_ROW : in_coarse ? TASK + LANES : BLOCK + LANES;
+        const int ROW = in_few ? FEW_ROW : in_coarse ? TASK + LANES : RUN + LANES;
         if (in_coarse) {
             // map_search.coarse_seed: the nodes are read once, then every target looks at all of them.
             constexpr int SIDE = COARSE_NODES, NODES = 6 * SIDE * SIDE, PADDED = (NODES + LANES - 1) / LANES * LANES;
@@ -215,9 +215,9 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
             numbers[l] = numbers[searched - 1];
             if (in_few) few_used[l] = few_used[searched - 1];
         }
-        // BLOCK of them at a time, in turns: what one vector waits for, its neighbours do.
-        for (int from = 0; from < searched; from += BLOCK) {
-            const int vectors = searched - from < BLOCK ? (searched - from + LANES - 1) / LANES : ROWS;
+        // RUN of them at a time, in turns: what one vector waits for, its neighbours do.
+        for (int from = 0; from < searched; from += RUN) {
+            const int vectors = searched - from < RUN ? (searched - from + LANES - 1) / LANES : ROWS;
             int open[ROWS], opened = vectors;
             bool begun = in_few;
             for (int k = 0; k < vectors; ++k) {
@@ -313,7 +313,7 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
                 on = 0;
                 for (int k = 0; k < opened; ++k) {
                     Search& g = group[open[k]];
-                    const int left = __builtin_popcount(bits(g.going)), few_left = round < BLOCKS ? FEW : 0;
+                    const int left = __builtin_popcount(bits(g.going)), few_left = round < RUNS ? FEW : 0;
                     g.later = left <= few_left ? g.going : I(0);
                     open[on] = open[k];
                     on += left > few_left;
