@@ -145,9 +145,17 @@ def take_rays_kernel(
     out_pixel: wp.array(dtype=int),
     out_index: wp.array(dtype=int),
 ):
-    """One thread per ray that goes on; `index` of length 0: the layer's rays are the first ones."""
+    """One thread per ray that goes on, -1: none; `index` of length 0: the layer's rays are the first ones."""
     k = first + wp.tid()
     i = going[k]
+    if i < 0:
+        out_point[k] = wp.vec3(0.0, 0.0, 0.0)
+        out_normal[k] = wp.vec3(0.0, 0.0, 0.0)
+        out_direction[k] = wp.vec3(0.0, 0.0, 0.0)
+        out_facet[k] = -1
+        out_pixel[k] = -1
+        out_index[k] = -1
+        return
     ray = asked[i]
     out_point[k] = point[i]
     out_normal[k] = normal[i]
@@ -170,9 +178,11 @@ def add_bounce_kernel(
     seen: wp.array(dtype=wp.vec3),
     out_total: wp.array(dtype=wp.vec3),
 ):
-    """One thread per ray; each adds to the total of its own pixel."""
+    """One thread per ray; each adds to the total of its own pixel, if there is one."""
     i = first + wp.tid()
     k = index[i]
+    if k < 0:
+        return
     changed = out_total[k] + wp.cw_mul(weight[i], seen[i]) - domes[i]
     # Domes that were added in another order leave a rounding of theirs.
     out_total[k] = wp.vec3(wp.max(changed[0], 0.0), wp.max(changed[1], 0.0), wp.max(changed[2], 0.0))

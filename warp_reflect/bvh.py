@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from itertools import accumulate
 
 import numpy as np
 import warp as wp
@@ -86,7 +87,9 @@ def is_on(
     bodies: wp.array(dtype=OwnBody),
     i: int,
 ) -> bool:
-    """Whether a mirror pixel is on a body too."""
+    """Whether a mirror pixel is on a body too; nothing is where there is none, -1, which is what pixel 0 counts back to."""
+    if pixel[i] < 0:
+        return False
     return body_at(scene, facets, pixel, body, bodies, i).first_triangle == body.first_triangle
 
 
@@ -114,7 +117,7 @@ def trace_pixels_kernel(
     out_distance: wp.array(dtype=float),
     out_status: wp.array(dtype=wp.uint8),
 ):
-    """One thread per asked mirror pixel; nothing is met where its number is -1.
+    """One thread per asked mirror pixel; nothing is written where its number is -1.
 
     `bodies` are those of patches; of length 0: `body` is all pixels' own. `known` is 1 for what `bvh_vector.first_met` has left.
     With a `status` a miss beside a hit, or without a neighbour, is asked again: a kernel of its own would be compiled for as long
@@ -127,11 +130,6 @@ def trace_pixels_kernel(
         if i < 0:
             return
     if pixel[i] < 0:
-        out_triangle[i] = -1
-        out_u[i] = 0.0
-        out_v[i] = 0.0
-        out_distance[i] = 0.0
-        out_status[i] = wp.uint8(NONE)
         return
     retry = status.shape[0]
     ray = direction[i]
@@ -240,10 +238,17 @@ def trace_bounced_kernel(
     out_distance: wp.array(dtype=float),
     out_status: wp.array(dtype=wp.uint8),
 ):
-    """One thread per asked ray; known 1: what `bvh_vector.first_met` has left."""
+    """One thread per asked ray; known 1: what `bvh_vector.first_met` has left. A ray without a facet meets nothing."""
     i = first + wp.tid()
     if indexed != 0:
         i = index[i]
+    if facet[i] < 0:
+        out_triangle[i] = -1
+        out_u[i] = 0.0
+        out_v[i] = 0.0
+        out_distance[i] = 0.0
+        out_status[i] = wp.uint8(NONE)
+        return
     body = bodies[scene.triangle_patch[facet[i]]]
     met = answered(known, out_triangle[i], out_u[i], out_v[i], out_distance[i])
     hit = trace_ray_from(mesh_id, scene, point[i], direction[i], normal[i], facet[i], body, 1, 0.0, met)
@@ -414,7 +419,8 @@ def trace_together(
         for layer, (part, convex) in zip(layers, mirrors, strict=True):
             trace_pixels(scene, gbuffer, layer.pixels, layer, part, convex, None, threads, kernels)
         return
-    leaving = [(first, body_of(scene, *mirror)) for (first, _, _), mirror in zip(whole.shares, mirrors, strict=True)]
+    firsts = accumulate((layer.pixels.count for layer in layers[:-1]), initial=0)
+    leaving = [(first, body_of(scene, *mirror)) for first, mirror in zip(firsts, mirrors, strict=True)]
     _trace(scene, gbuffer, tracer, whole.pixels, whole, leaving, bodies, None, threads, kernels)
 
 

@@ -18,7 +18,6 @@ from functools import cached_property
 import warp as wp
 
 from warp_reflect import launch, surface
-from warp_reflect.counts import Statistics
 from warp_reflect.effects import FINISHES
 from warp_reflect.frame import Frame, render_frame
 from warp_reflect.layers import Camera, ReflectionLayer
@@ -126,9 +125,11 @@ def why_not(scene: Scene, plan: Plan) -> str:
     for row in plan.rows:
         if row.technique != "raytraced":
             return f"{row.name} is solved by {row.technique}, and is drawn where it is seen; method=reference traces it"
-        for name in (*FINISHES, "second_bounce"):
+        for name in FINISHES:
             if row.effects[name].on:
                 return f"{row.name} has {name}, whose rays are listed first"
+        if row.effects["second_bounce"].numbers.get("solved"):
+            return f"{row.name} shows mirrors that are solved from the eye behind it; method=reference traces them"
     return ""
 
 
@@ -148,8 +149,9 @@ class _Told(Mapping):
             where, pixels = surface.told(layer.pixels, self._width)
             if pixels.count:
                 arrays = {name: getattr(layer, name)[where] for name in ("triangle", "u", "v", "distance", "status")}
-                counted = Statistics({"bvh": pixels.count})
-                found[id] = replace(layer, pixels=pixels, statistics=counted, **arrays)
+                counted = layer.statistics.anew()
+                counted["bvh"] = pixels.count
+                found[id] = replace(layer, pixels=pixels, statistics=counted, whole=None, **arrays)
         return found
 
     def __getitem__(self, id: int) -> ReflectionLayer:

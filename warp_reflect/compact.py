@@ -95,13 +95,16 @@ def positive_kernel(first: int, values: wp.array(dtype=wp.vec3), out_mark: wp.ar
 
 
 def positive(values: wp.array) -> wp.array:
-    """Ascending numbers of the elements of a vec3 array, none of whose numbers is below 0, that are not 0, int32."""
+    """Ascending numbers of the elements of a vec3 array, none of whose numbers is below 0, that are not 0, int32.
+
+    Where nothing is read -1 stands behind them, see `padded`.
+    """
     if not stays(values.device):
         x, y, z = values.numpy().T
         return listed(np.flatnonzero(x + y + z > 0.0), values.device)
     marks = wp.empty(len(values), dtype=wp.uint8, device=values.device)
     launch(positive_kernel, len(values), [values, marks], values.device)
-    return marked(marks, 1)
+    return marked(marks, 1) if reads() else padded(marks, 1)[0]
 
 
 @wp.kernel

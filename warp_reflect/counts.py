@@ -16,6 +16,12 @@ class Statistics(MutableMapping):
         """Add what is to be counted when it is asked for."""
         self._later.append(counted)
 
+    def anew(self) -> Statistics:
+        """The same, to be counted when it is asked: of what is done again the counts are others each time."""
+        made = Statistics(self._known)
+        made._later = list(self._later)
+        return made
+
     def _all(self) -> dict:
         while self._later:
             add_statistics(self._known, self._later.pop(0)())

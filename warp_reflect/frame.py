@@ -7,6 +7,7 @@ import importlib
 import os
 from collections.abc import Iterable, Mapping
 from functools import cached_property, partial
+from itertools import groupby
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -324,10 +325,10 @@ def reflect_scene(
         gbuffer, pixels = _look(scene, plan, view, timer)
         answered = {}
     seen = [row for row in plan.rows if row.reflector.id in pixels and pixels[row.reflector.id].count > 0]
-    asked = [row for row in seen if row.reflector.id not in answered]
+    groups = _together((row for row in plan.rows if row.reflector.id not in answered), pixels)
     with timer("prepare"):
-        plan.prepare_together(asked)
-    for rows in _together(asked, pixels):
+        plan.prepare_together(row for rows in groups for row in rows)
+    for rows in groups:
         with timer("prepare"):
             prepared = [plan.prepared(row) for row in rows]
         with timer("reflect"):
@@ -344,15 +345,22 @@ def reflect_scene(
 
 
 def _together(rows: Iterable[PlanRow], pixels: Mapping[int, MirrorPixels]) -> list[list[PlanRow]]:
-    """The rows in groups whose rays are treated alike and whose pixels follow one another."""
+    """Those of rows that are seen, in groups whose rays are treated alike and whose pixels follow one another.
+
+    What is treated otherwise divides groups even where it is not seen: they are the same wherever the eye is.
+    """
     groups: list[list[PlanRow]] = []
-    for row in rows:
-        last = groups[-1][-1] if groups else None
-        own, before = (pixels[each.reflector.id] for each in (row, last or row))
-        if last is not None and own.follows(before) and _treatment(row) == _treatment(last):
-            groups[-1].append(row)
-        else:
-            groups.append([row])
+    for _, alike in groupby(rows, _treatment):
+        before = None
+        for row in alike:
+            own = pixels.get(row.reflector.id)
+            if own is None or own.count == 0:
+                continue
+            if before is not None and own.follows(before):
+                groups[-1].append(row)
+            else:
+                groups.append([row])
+            before = own
     return groups
 
 

@@ -16,12 +16,13 @@ import warp as wp
 
 from warp_reflect import compact
 from warp_reflect.counts import Statistics
-from warp_reflect.launch import launch, module_part, stays
+from warp_reflect.launch import launch, module_part, reads, stays
 from warp_reflect.scene import CameraData, Scene
 from warp_reflect.settings import Status
 
 wp.set_module_options({"enable_backward": False})
 MET = module_part(__name__, "met")
+UNREAD = module_part(__name__, "unread")
 
 
 @wp.struct
@@ -238,8 +239,14 @@ class MirrorPixels:
         arrays = (compact.run(array, first, end) for array in (self.pixel, self.point, self.normal, self.direction))
         return MirrorPixels(reflector, *arrays, box, self, first)
 
+    def told(self) -> tuple[int, int]:
+        """The first of the entries that have a pixel, and their end, where they are `run`; read now."""
+        return tuple(self.run.numpy()[:2].tolist())
+
     def follows(self, other: MirrorPixels) -> bool:
-        """Whether they lie right behind another reflector's."""
+        """Whether they lie right behind another reflector's, as far as there are any."""
+        if self.run is not None:
+            return other.run is not None
         return self.whole is not None and self.whole is other.whole and self.first == other.first + other.count
 
     @staticmethod
@@ -247,6 +254,8 @@ class MirrorPixels:
         """Those of several reflectors, each of which follows the one before, as if they were the first one's."""
         if len(pixels) == 1:
             return pixels[0]
+        if pixels[0].run is not None:
+            return replace(pixels[0], pixel=_united([each.pixel for each in pixels]))
         left, top, right, bottom = zip(*(each.box for each in pixels), strict=True)
         box = min(left), min(top), max(right), max(bottom)
         return pixels[0].whole.part(pixels[0].reflector, pixels[0].first, pixels[-1].first + pixels[-1].count, box)
@@ -262,6 +271,23 @@ class MirrorPixels:
         arrays = (self.pixel, self.point, self.normal, self.direction)
         pixel, *vectors = (compact.taken(array, chosen) for array in arrays)
         return MirrorPixels(reflector, pixel, *vectors, pixel_bounds(pixel.numpy(), width))
+
+
+@wp.kernel(module=UNREAD)
+def united_kernel(first: int, one: wp.array(dtype=int), other: wp.array(dtype=int), out_pixel: wp.array(dtype=int)):
+    """One thread per entry, which has a pixel in one list at most."""
+    i = first + wp.tid()
+    out_pixel[i] = wp.max(one[i], other[i])
+
+
+def _united(pixels: Sequence[wp.array]) -> wp.array:
+    """Lists of pixels of the same entries in one."""
+    united, device = pixels[0], pixels[0].device
+    for each in pixels[1:]:
+        both = wp.empty(len(each), dtype=int, device=device)
+        launch(united_kernel, len(each), [united, each, both], device)
+        united = both
+    return united
 
 
 def pixel_bounds(pixel: np.ndarray, width: int) -> Box:
@@ -313,7 +339,7 @@ class ReflectionLayer:
             shaded at the hits.
         whole: The layer of several reflectors that all are answered and shaded together, whose slice this one is; None: it is
             alone.
-        shares: Of a whole: each reflector's first ray, the end of its rays, and its statistics.
+        shares: Of a whole, for each reflector: what gives its first ray and the end of its rays, and its statistics.
     """
 
     pixels: MirrorPixels
@@ -330,11 +356,13 @@ class ReflectionLayer:
     cells: list = field(default_factory=list)
     radiance: wp.array | None = None
     whole: ReflectionLayer | None = None
-    shares: list[tuple[int, int, Statistics]] = field(default_factory=list)
+    shares: list[tuple[Callable[[], tuple[int, int]], Statistics]] = field(default_factory=list)
 
     @classmethod
     def unset(cls, pixels: MirrorPixels, method: int, device) -> ReflectionLayer:
-        """For who answers every pixel: nothing is filled in."""
+        """For who answers every pixel: nothing is filled in, but where not every entry has one."""
+        if pixels.run is not None:
+            return cls.empty(pixels, method, device)
         kinds = {"triangle": int, "u": float, "v": float, "distance": float, "status": wp.uint8}
         room = {name: wp.empty(pixels.count, dtype=kind, device=device) for name, kind in kinds.items()}
         return cls(pixels=pixels, method=int(method), **room)
@@ -360,9 +388,11 @@ class ReflectionLayer:
         made, end = [], 0
         for each in pixels:
             first, end = end, end + each.count
-            arrays = (array[first:end] for array in (self.triangle, self.u, self.v, self.distance, self.status))
+            arrays, place = (self.triangle, self.u, self.v, self.distance, self.status), each.told
+            if each.run is None:
+                arrays, place = (array[first:end] for array in arrays), partial(tuple, (first, end))
             made.append(ReflectionLayer(each, self.method, *arrays, whole=self))
-            self.shares.append((first, end, made[-1].statistics))
+            self.shares.append((place, made[-1].statistics))
         return made
 
     def count_later(self, name: str, rays: Callable[[], np.ndarray]) -> None:
@@ -372,12 +402,13 @@ class ReflectionLayer:
             name: Of the statistics.
             rays: Gives their numbers among the layer's.
         """
-        numbers = cache(rays)
-        for first, end, statistics in self.shares or [(0, self.pixels.count, self.statistics)]:
-            statistics.later(partial(_counted, name, numbers, first, end))
+        numbers = cache(rays) if reads() else rays
+        for place, statistics in self.shares or [(partial(tuple, (0, self.pixels.count)), self.statistics)]:
+            statistics.later(partial(_counted, name, numbers, place))
 
 
-def _counted(name: str, numbers: Callable[[], np.ndarray], first: int, end: int) -> dict[str, int]:
+def _counted(name: str, numbers: Callable[[], np.ndarray], place: Callable[[], tuple[int, int]]) -> dict[str, int]:
+    first, end = place()
     count = int(np.count_nonzero((numbers() >= first) & (numbers() < end)))
     return {name: count} if count else {}
 
