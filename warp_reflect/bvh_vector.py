@@ -105,6 +105,25 @@ class Run:
             stop[row] = low = place_of((top + row + 1) * width, low, low + width < run.end ? low + width : run.end);
         }
     }
+    // Rays beside a tile and their answers' places, while those of the tile are on their way.
+    auto fetch_beside = [&](int row) {
+        if (at[row] == stop[row] || indexed != 0) return;
+        const int next = at[row];
+        // A row of a tile lies on two cache lines or three.
+        for (int word = 0; word < 3 * TILE_WIDTH; word += word ? 3 * TILE_WIDTH - 17 : 16) {
+            __builtin_prefetch(points + 3 * next + word);
+            __builtin_prefetch(normals + 3 * next + word);
+            __builtin_prefetch(directions + 3 * next + word);
+        }
+        __builtin_prefetch(facets.data + (pixel.shape[0] > 0 ? pixel.data[next] : next));
+        __builtin_prefetch(out_status.data + next, 1);
+        for (int last = next; last < next + TILE_WIDTH; last += TILE_WIDTH - 1) {
+            __builtin_prefetch(out_triangle.data + last, 1);
+            __builtin_prefetch(out_u.data + last, 1);
+            __builtin_prefetch(out_v.data + last, 1);
+            __builtin_prefetch(out_t.data + last, 1);
+        }
+    };
     auto take = [&]() {
         taken = 0;
         full = false;
@@ -140,23 +159,7 @@ class Run:
                 for (int row = 0; row < TILE_HEIGHT; ++row) {
                     row_start[row] = at[row];
                     at[row] = end[row];
-                    // The rays beside it and their answers' places are fetched while these are on their way.
-                    if (end[row] == stop[row]) continue;
-                    const int next = end[row];
-                    // A row of a tile lies on two cache lines or three.
-                    for (int word = 0; word < 3 * TILE_WIDTH; word += word ? 3 * TILE_WIDTH - 17 : 16) {
-                        __builtin_prefetch(points + 3 * next + word);
-                        __builtin_prefetch(normals + 3 * next + word);
-                        __builtin_prefetch(directions + 3 * next + word);
-                    }
-                    __builtin_prefetch(facets.data + (pixel.shape[0] > 0 ? pixel.data[next] : next));
-                    __builtin_prefetch(out_status.data + next, 1);
-                    for (int last = next; last < next + TILE_WIDTH; last += TILE_WIDTH - 1) {
-                        __builtin_prefetch(out_triangle.data + last, 1);
-                        __builtin_prefetch(out_u.data + last, 1);
-                        __builtin_prefetch(out_v.data + last, 1);
-                        __builtin_prefetch(out_t.data + last, 1);
-                    }
+                    fetch_beside(row);
                 }
                 taken = RAYS;
                 return;
@@ -167,7 +170,10 @@ class Run:
             for (int half = 0; half < 2; ++half)
                 for (int row = 0; row < TILE_HEIGHT; ++row)
                     for (int k = half ? middle[row] : at[row]; k < (half ? end[row] : middle[row]); ++k) ray[taken++] = ray_at(k);
-            for (int row = 0; row < TILE_HEIGHT; ++row) at[row] = end[row];
+            for (int row = 0; row < TILE_HEIGHT; ++row) {
+                at[row] = end[row];
+                fetch_beside(row);
+            }
         }
     };
     // Of a full tile rays follow one another in fours, which begin there: rows are read and turned.
