@@ -77,24 +77,36 @@ TREE = (
         widen(by.x, by.down_x); widen(by.y, by.down_y); widen(by.z, by.down_z);
         return by;
     };
-    auto meets = [&](const Span& by, auto in, auto out, auto& enter, auto& leave) {
+    // Where the first of them may enter between two planes, and the last leave; and about where they all have entered, and
+    // where none has left.
+    auto meets_all = [&](const Span& by, auto in, auto out, auto& enter, auto& leave, auto& all_in, auto& none_out) {
         const auto a = in - by.enter_from, b = out - by.leave_from;
         const auto a_low = a * by.low, a_high = a * by.high, b_low = b * by.low, b_high = b * by.high;
-        const auto first = a_low < a_high ? a_low : a_high;
-        const auto last = b_low > b_high ? b_low : b_high;
+        const auto first = a_low < a_high ? a_low : a_high, late = a_low > a_high ? a_low : a_high;
+        const auto last = b_low > b_high ? b_low : b_high, early = b_low < b_high ? b_low : b_high;
         enter = first > enter ? first : enter;
         leave = last < leave ? last : leave;
+        all_in = late > all_in ? late : all_in;
+        none_out = early < none_out ? early : none_out;
     };
-    // Which of a node's eight children some of the rays may meet nearer than `far`, a bit each, and where they enter them.
-    auto children_met = [&](const Bundle& by, const float* boxes, float far, Row& enter) -> unsigned {
+    auto meets = [&](const Span& by, auto in, auto out, auto& enter, auto& leave) {
+        auto all_in = enter, none_out = leave;
+        meets_all(by, in, out, enter, leave, all_in, none_out);
+    };
+    // Which of a node's eight children some of the rays may meet nearer than `far`, a bit each, and where they enter them;
+    // `all`: those that about all of the rays meet, at any distance.
+    auto children_met = [&](const Bundle& by, const float* boxes, float far, Row& enter, unsigned& all) -> unsigned {
         auto row = [&](int k) -> Row { Row v; __builtin_memcpy(&v, boxes + k, sizeof(v)); return v; };
-        Row leave = Row(3.0e38f);
+        Row leave = Row(3.0e38f), all_in = Row(0.0f), none_out = Row(3.0e38f);
         enter = Row(0.0f);
-        meets(by.x, row(by.down_x ? 24 : 0), row(by.down_x ? 0 : 24), enter, leave);
-        meets(by.y, row(by.down_y ? 32 : 8), row(by.down_y ? 8 : 32), enter, leave);
-        meets(by.z, row(by.down_z ? 40 : 16), row(by.down_z ? 16 : 40), enter, leave);
-        const RowMask passed = (leave >= enter) & (enter < far);
-        return __builtin_bit_cast(unsigned char, __builtin_convertvector(passed < 0, RowBits));
+        meets_all(by.x, row(by.down_x ? 24 : 0), row(by.down_x ? 0 : 24), enter, leave, all_in, none_out);
+        meets_all(by.y, row(by.down_y ? 32 : 8), row(by.down_y ? 8 : 32), enter, leave, all_in, none_out);
+        meets_all(by.z, row(by.down_z ? 40 : 16), row(by.down_z ? 16 : 40), enter, leave, all_in, none_out);
+        auto marked_bits = [](RowMask of) -> unsigned {
+            return __builtin_bit_cast(unsigned char, __builtin_convertvector(of < 0, RowBits));
+        };
+        all = marked_bits(none_out >= all_in);
+        return marked_bits((leave >= enter) & (enter < far));
     };
     // A child is on its way while others are asked.
     auto fetch = [&](int child) {
@@ -193,13 +205,14 @@ TRAVERSAL = (
             }
             const Bundle by = bundle_of(all, signs, no_zeros);
             float far = folded(all.furthest, larger);
+            // `child`: where it stands; inverted where a branch with other branches below it need not be asked ray by ray.
             struct Waiting { int child; float enter; } waiting[DEEPEST];
             int waiting_count = 0, node = 0;
             while (node >= 0) {
                 const float* boxes = tree_nodes + 64 * node;
                 const int* children = (const int*)(boxes + 48);
                 Row enter;
-                unsigned found = children_met(by, boxes, far, enter);
+                unsigned all_meet, found = children_met(by, boxes, far, enter, all_meet);
                 if (left_out) found &= ~left_out[node];
                 float entered[8];
                 __builtin_memcpy(entered, &enter, sizeof(entered));
@@ -210,14 +223,16 @@ TRAVERSAL = (
                     fetch(child);
                     int place = waiting_count++;
                     for (; place > from && waiting[place - 1].enter < entered[slot]; --place) waiting[place] = waiting[place - 1];
-                    waiting[place] = Waiting{64 * node + slot, entered[slot]};
+                    const int stands = 64 * node + slot;
+                    waiting[place] = Waiting{child > 0 && all_meet >> slot & 1 ? ~stands : stands, entered[slot]};
                 }
                 node = -1;
                 while (waiting_count > 0) {
                     const Waiting next = waiting[--waiting_count];
                     if (next.enter >= far) continue;
-                    const float* of = tree_nodes + next.child;
+                    const float* of = tree_nodes + (next.child < 0 ? ~next.child : next.child);
                     const int child = ((const int*)of)[48];
+                    if (next.child < 0) { node = child; break; }
                     I asked[GROUPS], any = I(0);
                     if (alone) {
                         EACH_GROUP asked[g] = I(0);
