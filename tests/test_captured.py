@@ -133,6 +133,17 @@ def test_ordinary_frames_are_what_they_were():
     assert not np.array_equal(other["RGBA"], before["RGBA"])
 
 
+def test_other_times_of_the_stage_may_be_drawn_between():
+    scene = wr.load_stage(ROOT / "usd_scenes" / "city_block.usda")
+    assert scene.moving_parts
+    plan = planned(scene, shadows="on")
+    repeated = wr.capture_frame(scene, plan)
+    before = repeated.render()["RGBA"].copy()
+    later = wr.render_frame(scene.at(2.0), plan)
+    assert not np.array_equal(later["RGBA"], before)
+    np.testing.assert_array_equal(repeated.render()["RGBA"], before)
+
+
 def test_nothing_is_told_of_a_frame_that_was_drawn_over():
     scene = room(sphere(), placed(0, 0, -1))
     repeated = wr.capture_frame(scene, planned(scene))

@@ -58,6 +58,7 @@ class CapturedFrame:
             with wp.ScopedCapture(scene.device) as capture:
                 self._recorded = render_frame(scene, plan, seat)
         self._graph = capture.graph
+        self._held = dict(scene.facts)  # what launches read, and the scene may replace where other plans ask it
         self._last: Frame | None = None
 
     def render(self, camera: str | Camera | None = None, previous: Frame | None = None) -> Frame:
@@ -83,6 +84,7 @@ class CapturedFrame:
             self._last.gone = self._last.layers.gone = True
         timer = StageTimer(self.scene.device)
         with timer("replay"):
+            self._fit_trees()
             wp.copy(self._place, view.view(self.scene))
             wp.capture_launch(self._graph)
         recorded = self._recorded
@@ -90,6 +92,14 @@ class CapturedFrame:
         layers = _Told(recorded.layers, view.size[0])
         self._last = Frame(self.scene, plan, gbuffer, layers, recorded._picture, timer.ms, previous)
         return self._last
+
+    def _fit_trees(self) -> None:
+        """Other times of the stage may have fitted the trees to theirs."""
+        tracers = [self.scene.tracer, *(self.scene.mirror_tracer(row.reflector.part) for row in self.plan.rows)]
+        if self.plan.shadows is not None:
+            tracers.append(self.scene.shadow_tracer)
+        for tracer in tracers:
+            _ = tracer.id
 
 
 def capture_frame(scene: Scene, plan: Plan) -> CapturedFrame:
