@@ -202,6 +202,30 @@ Box = tuple[int, int, int, int]  # x0, y0, x1, y1, half-open [pixels]
 NO_REFLECTOR = 0  # id of rays that no mirror has reflected
 
 
+class Sliced:
+    """An array of a dataclass that a part of a whole (`_part`) gets as a slice when it is first asked for.
+
+    Mostly none is: launches go over the wholes, and each array that is made costs a frame as much as half a launch.
+    """
+
+    def __set_name__(self, owner, name: str):
+        self._name = name
+
+    def __get__(self, part, owner=None) -> wp.array:
+        if part is None:
+            raise AttributeError(self._name)  # so that the dataclass has no default
+        made = vars(part)[self._name] = compact.run(getattr(part.whole, self._name), part.first, part.end)
+        return made
+
+
+def _part(whole, first: int, end: int, **own):
+    """What a whole is, from element `first` on, with some attributes of its own."""
+    part = object.__new__(type(whole))
+    others = {name: value for name, value in vars(whole).items() if not isinstance(value, wp.array)}
+    vars(part).update(others, whole=whole, first=first, end=end, **own)
+    return part
+
+
 @dataclass
 class MirrorPixels:
     """The pixels at which one reflector is seen, compacted, with the surface every technique reflects at.
@@ -213,31 +237,32 @@ class MirrorPixels:
         normal: vec3 [n], unit, on the eye's side.
         direction: vec3 [n], unit reflected direction.
         box: (x0, y0, x1, y1), half-open bounds of the pixels.
-        whole: Those of several reflectors, one after the other, whose slice from `first` on these are; None: they are alone.
+        whole: Those of several reflectors, one after the other, whose slice from `first` to `end` these are; None: they
+            are alone.
         run: Where nothing is read (`launch.unread`) there are as many entries as the picture has pixels, of which those
             without a pixel have the number -1; which ones have one is on the device (`surface.told`). None: all of them.
     """
 
     reflector: int
-    pixel: wp.array
-    point: wp.array
-    normal: wp.array
-    direction: wp.array
+    pixel: wp.array = Sliced()
+    point: wp.array = Sliced()
+    normal: wp.array = Sliced()
+    direction: wp.array = Sliced()
     box: Box
     whole: MirrorPixels | None = None
     first: int = 0
+    end: int = 0
     run: wp.array | None = None
 
     @property
     def count(self) -> int:
-        return len(self.pixel)
+        return len(self.pixel) if self.whole is None else self.end - self.first
 
     def part(self, reflector: int, first: int, end: int, box: Box) -> MirrorPixels:
         """One reflector's of a whole's."""
         if end - first == self.count:
             return replace(self, reflector=reflector, box=box)
-        arrays = (compact.run(array, first, end) for array in (self.pixel, self.point, self.normal, self.direction))
-        return MirrorPixels(reflector, *arrays, box, self, first)
+        return _part(self, first, end, reflector=reflector, box=box)
 
     def told(self) -> tuple[int, int]:
         """The first of the entries that have a pixel, and their end, where they are `run`; read now."""
@@ -247,7 +272,7 @@ class MirrorPixels:
         """Whether they lie right behind another reflector's, as far as there are any."""
         if self.run is not None:
             return other.run is not None
-        return self.whole is not None and self.whole is other.whole and self.first == other.first + other.count
+        return self.whole is not None and self.whole is other.whole and self.first == other.end
 
     @staticmethod
     def joined(pixels: Sequence[MirrorPixels]) -> MirrorPixels:
@@ -258,7 +283,7 @@ class MirrorPixels:
             return replace(pixels[0], pixel=_united([each.pixel for each in pixels]))
         left, top, right, bottom = zip(*(each.box for each in pixels), strict=True)
         box = min(left), min(top), max(right), max(bottom)
-        return pixels[0].whole.part(pixels[0].reflector, pixels[0].first, pixels[-1].first + pixels[-1].count, box)
+        return pixels[0].whole.part(pixels[0].reflector, pixels[0].first, pixels[-1].end, box)
 
     def select(self, chosen: wp.array, reflector: int, width: int) -> MirrorPixels:
         """Some of the pixels under another id.
@@ -337,18 +362,18 @@ class ReflectionLayer:
         cells: What an interpolation grid ended with: `grid.UsedCells` of every piece that has one.
         radiance: vec3 [n], what is seen at each pixel where the technique knows it itself (environment maps); None: it is
             shaded at the hits.
-        whole: The layer of several reflectors that all are answered and shaded together, whose slice this one is; None: it is
-            alone.
+        whole: The layer of several reflectors that all are answered and shaded together, whose slice from `first` to `end`
+            this one is; None: it is alone.
         shares: Of a whole, for each reflector: what gives its first ray and the end of its rays, and its statistics.
     """
 
     pixels: MirrorPixels
     method: int
-    triangle: wp.array
-    u: wp.array
-    v: wp.array
-    distance: wp.array
-    status: wp.array
+    triangle: wp.array = Sliced()
+    u: wp.array = Sliced()
+    v: wp.array = Sliced()
+    distance: wp.array = Sliced()
+    status: wp.array = Sliced()
     statistics: Statistics | dict = field(default_factory=Statistics)
     timings: Statistics | dict = field(default_factory=dict)
     history: object = None
@@ -356,6 +381,8 @@ class ReflectionLayer:
     cells: list = field(default_factory=list)
     radiance: wp.array | None = None
     whole: ReflectionLayer | None = None
+    first: int = 0
+    end: int = 0
     shares: list[tuple[Callable[[], tuple[int, int]], Statistics]] = field(default_factory=list)
 
     @classmethod
@@ -388,11 +415,12 @@ class ReflectionLayer:
         made, end = [], 0
         for each in pixels:
             first, end = end, end + each.count
-            arrays, place = (self.triangle, self.u, self.v, self.distance, self.status), each.told
+            told, run, own = each.told, (0, self.pixels.count), Statistics()
             if each.run is None:
-                arrays, place = (array[first:end] for array in arrays), partial(tuple, (first, end))
-            made.append(ReflectionLayer(each, self.method, *arrays, whole=self))
-            self.shares.append((place, made[-1].statistics))
+                run = first, end
+                told = partial(tuple, run)
+            made.append(_part(self, *run, pixels=each, statistics=own, timings={}, virtual=[], cells=[], shares=[]))
+            self.shares.append((told, own))
         return made
 
     def count_later(self, name: str, rays: Callable[[], np.ndarray]) -> None:
