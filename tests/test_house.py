@@ -25,7 +25,7 @@ FLOORS = {
     "any_hit shapes bodies topology cubemap quadrics quadric_roots quadric_curve quadric_fit heightfield heightfield_vector "
     "grid_rays occupancy voxels "
     "images metrics timing clipping cutouts",
-    2: "scene scene_times reflectors environment_maps baked_maps "
+    2: "scene scene_times at_rest reflectors environment_maps baked_maps "
     "segments layers trees ray_walk bvh raster raster_pieces raster_vector raster_rays_vector shade shade_vector surface "
     "surface_vector pictures textures holes cut_shadows "
     "normal_maps bounces direct shadow_starts shadow_neighbours shadows transmission "

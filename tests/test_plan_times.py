@@ -36,6 +36,12 @@ MIRROR = """
     {
         double3 xformOp:translate.timeSamples = { 1: (0.035, 0.934158, -0.17), 9: (0.3, 1.2, -0.5) }
     }"""
+STRETCHED = """
+    over "ChromeEllipsoid"
+    {
+        double3 xformOp:translate.timeSamples = { 1: (0.43, 0.908368, 0.04), 9: (0.5, 1.1, -0.3) }
+        float3 xformOp:rotateXYZ.timeSamples = { 6: (0, 16, 0), 9: (0, 70, 20) }
+    }"""
 CAMERA = """
     over "Camera"
     {
@@ -71,6 +77,7 @@ ROUGH = """
 KITCHENS = {
     "the table": TABLE,
     "a mirror": MIRROR,
+    "a stretched mirror that slides, then turns": STRETCHED,
     "the camera": CAMERA,
     "all three": TABLE + MIRROR + CAMERA,
     "what is there": TABLE + SEEN,

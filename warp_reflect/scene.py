@@ -15,6 +15,7 @@ from functools import cached_property
 import numpy as np
 import warp as wp
 
+from warp_reflect.at_rest import AtRest, placed_normals, placed_points
 from warp_reflect.baked_maps import BakedMap
 from warp_reflect.bodies import Body, analyse, is_similarity
 from warp_reflect.cutouts import Cutouts, no_cutouts
@@ -315,26 +316,6 @@ class PartRange:
     is_whole: bool  # no other part shares the vertices
 
 
-@dataclass(frozen=True)
-class AtRest:
-    """A part of what moves, in the frame of its mesh.
-
-    Attributes:
-        key: (mesh, which of its parts).
-        mesh, own: Those.
-        scene_from_object: Where it stands: a similarity, float64 [4, 4].
-    """
-
-    key: tuple[int, int]
-    mesh: MeshData
-    own: Part
-    scene_from_object: np.ndarray
-
-    @property
-    def is_mirrored(self) -> bool:
-        return bool(np.linalg.det(self.scene_from_object[:3, :3]) < 0.0)
-
-
 class Scene:
     """A `SceneData` on a device.
 
@@ -360,7 +341,7 @@ class Scene:
         self.notes = list(data.notes)
         self._reload = reload
         self.bodies: dict[int, Body] = {}
-        # (mesh, which of its parts, what) -> what was found out about the shape of what moves, in the frame of the mesh.
+        # (*key of `AtRest`, what) -> what was found out about the shape of what moves, and which one that was.
         self.facts_at_rest: dict = {}
         self.part_tracers: dict = {}
         self.mirror_tracers: dict = {}  # material -> the structure over what a mirror of it may show
@@ -658,35 +639,33 @@ class Scene:
         rest = self.at_rest(part)
         if rest is None:
             return None
-
-        def make() -> Body:
-            first, count = rest.own.first_triangle, rest.own.triangle_count
-            return analyse(rest.mesh.points, rest.mesh.triangles[first : first + count])
-
-        return self.kept_at_rest(rest, "body", make).placed(rest.scene_from_object)
+        return self.kept_at_rest(rest, "body", lambda: analyse(*rest.shape()[:2])).placed(rest.scene_from_rest)
 
     def at_rest(self, part: int) -> AtRest | None:
-        """A part in the frame of its mesh; None where it does not move, or is placed by more than a similarity."""
+        """A part that moves, where it does not; None: it never does."""
         prim = self.parts[part].prim
         instance = self.data.instances[prim - 1]
         if not instance.moves:
             return None
-        scene_from_object = self.scene_from_object(instance)
-        if not is_similarity(scene_from_object):
-            return None
         first = part
         while first and self.parts[first - 1].prim == prim:
             first -= 1
-        mesh = self.data.meshes[instance.mesh]
+        mesh, place = self.data.meshes[instance.mesh], self.scene_from_object(instance)
         own = (mesh.parts or [Part(0, len(mesh.triangles))])[part - first]
-        return AtRest((instance.mesh, part - first), mesh, own, scene_from_object)
+        key, stretch = (instance.mesh, part - first), None
+        if not is_similarity(place):
+            key, stretch, shift = (*key, prim), place[:3, :3].copy(), np.eye(4)
+            shift[:3, 3] = place[:3, 3]
+            place = shift
+        return AtRest(key, mesh, own, place, stretch)
 
     def kept_at_rest(self, rest: AtRest, what: str, make: Callable):
-        """What `make()` gives of a part in the frame of its mesh, kept wherever that stands."""
-        key = *rest.key, what
-        if key not in self.facts_at_rest:
-            self.facts_at_rest[key] = make()
-        return self.facts_at_rest[key]
+        """What `make()` gives of a part at rest, kept wherever that stands; of what is stretched until it turns."""
+        key, given = (*rest.key, what), b"" if rest.stretch is None else rest.stretch.tobytes()
+        known = self.facts_at_rest.get(key)
+        if known is None or known[0] != given:
+            known = self.facts_at_rest[key] = given, make()
+        return known[1]
 
     def scene_from_object(self, instance: InstanceData) -> np.ndarray:
         """float64 [4, 4] of an instance."""
@@ -779,32 +758,6 @@ def _stack(arrays: list, empty: tuple, dtype) -> np.ndarray:
     if not arrays:
         return np.zeros(empty, dtype)
     return (arrays[0] if len(arrays) == 1 else np.concatenate(arrays)).astype(dtype, copy=False)
-
-
-def placed_points(points: np.ndarray, scene_from_object: np.ndarray) -> np.ndarray:
-    """A mesh's points in the scene frame, float32.
-
-    Args:
-        points: [n, 3].
-        scene_from_object: [4, 4], or [4, 4, n] of points that are placed each for itself, with the same bits.
-    """
-    x, y, z = np.ascontiguousarray(points.T, np.float64)
-    placed = np.empty((len(points), 3), np.float32)
-    for k, row in enumerate(scene_from_object[:3]):
-        placed[:, k] = row[0] * x + row[1] * y + row[2] * z + row[3]
-    return placed
-
-
-def placed_normals(normals: np.ndarray, object_from_scene: np.ndarray) -> np.ndarray:
-    """A mesh's normals in the scene frame, float32, of unit length; arguments as for `placed_points`, [3, 3] or [3, 3, n]."""
-    x, y, z = np.ascontiguousarray(normals.T, np.float64)
-    m = object_from_scene
-    turned = [m[0][k] * x + m[1][k] * y + m[2][k] * z for k in range(3)]
-    length = np.maximum(np.sqrt(turned[0] * turned[0] + turned[1] * turned[1] + turned[2] * turned[2]), 1e-300)
-    placed = np.empty((len(normals), 3), np.float32)
-    for k in range(3):
-        placed[:, k] = turned[k] / length
-    return placed
 
 
 def first_rows(data: SceneData) -> tuple[np.ndarray, np.ndarray]:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 import numpy as np
 import warp as wp
 
+from warp_reflect.at_rest import placed_normals, placed_points
 from warp_reflect.scene import (
     InstanceData,
     MeshData,
@@ -22,8 +23,6 @@ from warp_reflect.scene import (
     SceneView,
     box_corners,
     first_rows,
-    placed_normals,
-    placed_points,
     unit_from_scene,
 )
 

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from warp_reflect.at_rest import AtRest
 from warp_reflect.bodies import Sheet, fit_sheet, overhang, weld
-from warp_reflect.scene import AtRest, PartRange, Scene
+from warp_reflect.scene import PartRange, Scene
 from warp_reflect.topology import edge_neighbours
 
 EDGE_SINE_MAX = 0.3  # 17 degrees; facets of a coarse but smooth body stay below, the rim of a cylinder is far above
@@ -98,13 +99,11 @@ def part_mesh(scene: Scene, part: PartRange) -> tuple[np.ndarray, np.ndarray, np
 
 
 def mesh_at_rest(rest: AtRest) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The same of a part that moves, in the frame of its mesh."""
-    mesh, triangles = rest.mesh, slice(rest.own.first_triangle, rest.own.first_triangle + rest.own.triangle_count)
-    faces = mesh.triangles[triangles]
-    if mesh.normals is None:
-        return mesh.points, faces, _corner_normals(mesh.points, faces, np.full_like(faces, -1), mesh.points)
-    index = faces if mesh.normal_index is None else mesh.normal_index[triangles]
-    return mesh.points, faces, _corner_normals(mesh.points, faces, index, mesh.normals)
+    """The same of a part that moves, in the frame where it rests."""
+    points, faces, normals, index = rest.shape()
+    if normals is None:
+        return points, faces, _corner_normals(points, faces, np.full_like(faces, -1), points)
+    return points, faces, _corner_normals(points, faces, index, normals)
 
 
 def _corner_normals(points: np.ndarray, faces: np.ndarray, index: np.ndarray, normals: np.ndarray) -> np.ndarray:

@@ -74,7 +74,7 @@ def sheets_of(scene: Scene, part_index: int) -> list[Sheet]:
             found = _recognised(*part_mesh(scene, part), part.first_triangle)
         else:
             known = scene.kept_at_rest(rest, "sheets", lambda: _recognised(*mesh_at_rest(rest), 0))
-            found = [sheet.placed(rest.scene_from_object, part.first_triangle) for sheet in known]
+            found = [sheet.placed(rest.scene_from_rest, part.first_triangle) for sheet in known]
         scene.fits[part_index] = found
     return scene.fits[part_index]
 
