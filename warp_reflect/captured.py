@@ -55,7 +55,7 @@ class CapturedFrame:
         with launch.unread():
             # Once before: what is compiled, prepared and kept is so before the launches are written down.
             render_frame(scene, plan, seat)
-            with wp.ScopedCapture(scene.device) as capture:
+            with wp.ScopedCapture(scene.device, force_module_load=False) as capture:
                 self._recorded = render_frame(scene, plan, seat)
         self._graph = capture.graph
         self._held = dict(scene.facts)  # what launches read, and the scene may replace where other plans ask it
