@@ -77,9 +77,15 @@ class Run:
     const float* points = (const float*)point.data;
     const float* normals = (const float*)normal.data;
     const float* directions = (const float*)direction.data;
+    // Arrays' own pointers would be read anew after whatever is written.
+    const int *orders = indexed != 0 ? index.data : 0, *pixels = numbers.data, *facet_at = facets.data;
+    const int* facet_of = pixel.shape[0] > 0 ? pixel.data : 0;
+    int* triangle_to = out_triangle.data;
+    float *u_to = out_u.data, *v_to = out_v.data, *t_to = out_t.data;
+    unsigned char* status_to = out_status.data;
     // What is at a place of the order that is asked for.
-    auto ray_at = [&](int place) -> int { return indexed != 0 ? index.data[place] : place; };
-    auto number_at = [&](int place) -> int { return numbers.data[ray_at(place)]; };
+    auto ray_at = [&](int place) -> int { return orders ? orders[place] : place; };
+    auto number_at = [&](int place) -> int { return pixels[ray_at(place)]; };
     // Rays that go together: those of a tile, row by row of either half, or the next of a block.
     constexpr int RAYS = TILE_WIDTH * TILE_HEIGHT, GROUPS = RAYS / LANES;
     struct Tile { enum { value = GROUPS }; bool alone; bool first_alone() const { return alone; } };
@@ -115,13 +121,13 @@ class Run:
             __builtin_prefetch(normals + 3 * next + word);
             __builtin_prefetch(directions + 3 * next + word);
         }
-        __builtin_prefetch(facets.data + (pixel.shape[0] > 0 ? pixel.data[next] : next));
-        __builtin_prefetch(out_status.data + next, 1);
+        __builtin_prefetch(facet_at + (facet_of ? facet_of[next] : next));
+        __builtin_prefetch(status_to + next, 1);
         for (int last = next; last < next + TILE_WIDTH; last += TILE_WIDTH - 1) {
-            __builtin_prefetch(out_triangle.data + last, 1);
-            __builtin_prefetch(out_u.data + last, 1);
-            __builtin_prefetch(out_v.data + last, 1);
-            __builtin_prefetch(out_t.data + last, 1);
+            __builtin_prefetch(triangle_to + last, 1);
+            __builtin_prefetch(u_to + last, 1);
+            __builtin_prefetch(v_to + last, 1);
+            __builtin_prefetch(t_to + last, 1);
         }
     };
     auto take = [&]() {
@@ -293,11 +299,11 @@ class Run:
             if (full) {
                 for (int l = 0; l < LANES; l += 4) {
                     const int start = four_of(g * LANES + l);
-                    const int* of = facets.data + (pixel.shape[0] > 0 ? pixel.data[start] : start);
+                    const int* of = facet_at + (facet_of ? facet_of[start] : start);
                     for (int k = 0; k < 4; ++k) facet[l + k] = of[k];
                 }
             } else {
-                facet = igather(facets.data, pixel.shape[0] > 0 ? igather(pixel.data, own[g]) : own[g]);
+                facet = igather(facet_at, facet_of ? igather(facet_of, own[g]) : own[g]);
             }
             I first = I(run.first_triangle), length = I(run.triangle_count);
             if (bodies.shape[0] > 0) {
@@ -335,20 +341,20 @@ class Run:
             if (full) {
                 for (int l = 0; l < LANES; l += 4) {
                     const int start = four_of(g * LANES + l);
-                    __builtin_memcpy(out_triangle.data + start, face + l, 16);
-                    __builtin_memcpy(out_u.data + start, u + l, 16);
-                    __builtin_memcpy(out_v.data + start, v + l, 16);
-                    __builtin_memcpy(out_t.data + start, t + l, 16);
-                    for (int k = 0; k < 4; ++k) out_status.data[start + k] = (unsigned char)told[l + k];
+                    __builtin_memcpy(triangle_to + start, face + l, 16);
+                    __builtin_memcpy(u_to + start, u + l, 16);
+                    __builtin_memcpy(v_to + start, v + l, 16);
+                    __builtin_memcpy(t_to + start, t + l, 16);
+                    for (int k = 0; k < 4; ++k) status_to[start + k] = (unsigned char)told[l + k];
                 }
             } else {
                 for (unsigned some = bits(live[g]); some != 0; some &= some - 1) {
                     const int l = __builtin_ctz(some), i = at[l];
-                    out_triangle.data[i] = face[l];
-                    out_u.data[i] = u[l];
-                    out_v.data[i] = v[l];
-                    out_t.data[i] = t[l];
-                    out_status.data[i] = (unsigned char)told[l];
+                    triangle_to[i] = face[l];
+                    u_to[i] = u[l];
+                    v_to[i] = v[l];
+                    t_to[i] = t[l];
+                    status_to[i] = (unsigned char)told[l];
                 }
             }
         }
