@@ -524,6 +524,26 @@ def test_maps_are_searched_as_the_plain_kernel_does(bodies_of_maps, name):
             np.testing.assert_array_equal(values, vectors[field], err_msg=field)
 
 
+@pytest.mark.parametrize("name", ["ellipsoid", "needle", "rounded box", "half"])
+def test_edges_end_in_sight_where_the_plain_kernel_has_them_end(bodies_of_maps, name):
+    drawn_map, eye = bodies_of_maps[name], (2.5, 1.2, 1.7)
+    points = hard_points(None, eye)
+    frame, _ = looking_at_origin(eye)
+    rng = np.random.default_rng(5)
+    edges = rng.integers(0, len(points), (1000, 2)).astype(np.int32)
+    edges[::7, 0] = -1
+    given = [wp.array(points, dtype=wp.vec3, device=CPU), drawn_map, frame, wp.array(edges, dtype=wp.vec2i, device=CPU)]
+    found = {}
+    for kernels, threads in (("plain", 1), ("vector", 1), ("vector", 2)):
+        out = wp.full(len(edges), wp.vec3(7.0, 7.0, 7.0), dtype=wp.vec3, device=CPU)
+        reflector_map.boundary(*given, 12, out, CPU, threads, kernels)
+        found[kernels, threads] = out.numpy()
+    assert np.isfinite(found["plain", 1]).all()
+    assert (found["plain", 1][::7] == 7.0).all()
+    np.testing.assert_array_equal(found["vector", 1], found["plain", 1])
+    np.testing.assert_array_equal(found["vector", 2], found["plain", 1])
+
+
 @pytest.mark.parametrize("name", ["ellipsoid", "needle"])
 def test_vertices_step_from_directions_as_the_plain_kernel_has_them(bodies_of_maps, name):
     """Cells of all sizes about the mirror, some hidden, some with corners behind it; answers that are there already."""

@@ -29,7 +29,6 @@ ROWS = {
     "quadric": (*FORWARD, "techniques.quadric_patch", "|techniques.quadric_vector"),
     "reflector_map": (
         *FORWARD,
-        "techniques.reflector_map",
         "|techniques.map_vector",
         "-techniques.reflector_map/plain",
     ),

@@ -11,7 +11,7 @@ from warp_reflect import vector
 from warp_reflect.layers import CameraView
 from warp_reflect.reflector_maps import ReflectorMapView
 from warp_reflect.techniques.interpolation import CONVERGED, HIDDEN, RESIDUAL_MAX, ChunkView
-from warp_reflect.techniques.lanes import REFLECTOR_MAP, VIRTUAL_VERTEX
+from warp_reflect.techniques.lanes import MAP_SAMPLES, MAP_STEPS, VIRTUAL_VERTEX
 from warp_reflect.techniques.map_search import ACCEPTED, CONVEX_SHARE, DET_MIN, NORMAL_PART_MIN, SPD_SHARE, STEP_CAP
 from warp_reflect.techniques.vertices import ESTIMATE, SQUARED_MAX, SQUARED_MIN, SolveFrame, VertexView
 
@@ -21,7 +21,8 @@ wp.set_module_options({"enable_backward": False})
 @wp.func_native(
     vector.snippet(
         VIRTUAL_VERTEX
-        + REFLECTOR_MAP
+        + MAP_SAMPLES
+        + MAP_STEPS
         + r"""
     const int cell = chunks.cell.data[chunk];
     const int begin = chunks.range.data[chunk][0], end = begin + chunks.range.data[chunk][1];

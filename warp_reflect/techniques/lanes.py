@@ -6,8 +6,8 @@ follow the head of `vector.snippet` and name the arguments `frame`, `camera` and
 
 from __future__ import annotations
 
-# What every search ends with: `vertices.edge_reach`, `vertices.virtual_vertex`, `layers.project`.
-VIRTUAL_VERTEX = r"""
+# What every search begins with.
+UNIT_FRAME = r"""
     const V eye = spread(frame.eye);
     auto root = [](F a) -> F { return __builtin_elementwise_sqrt(a); };
     auto magnitude = [](F a) -> F { return __builtin_elementwise_abs(a); };
@@ -18,6 +18,13 @@ VIRTUAL_VERTEX = r"""
             m.data[1][0] * a.x + m.data[1][1] * a.y + m.data[1][2] * a.z,
             m.data[2][0] * a.x + m.data[2][1] * a.y + m.data[2][2] * a.z};
     };
+    (void)root; (void)magnitude; (void)length; (void)over; (void)matrix;
+"""
+
+# What every search ends with: `vertices.edge_reach`, `vertices.virtual_vertex`, `layers.project`.
+VIRTUAL_VERTEX = (
+    UNIT_FRAME
+    + r"""
     // optics.safe_normalize
     auto safe = [&](V a, F& big) -> I {
         big = size(a);
@@ -137,14 +144,14 @@ VIRTUAL_VERTEX = r"""
     };
     (void)safe_normalize; (void)safe_length; (void)tangents; (void)edge_reach; (void)virtual_vertex; (void)settle; (void)seeds;
 """
+)
 
-# `reflector_maps.sample_map`, and of `map_search`: `measure`, `newton_step`, `step_on_cube`.
-REFLECTOR_MAP = r"""
+# `reflector_maps.sample_map`, after either.
+MAP_SAMPLES = r"""
     const V inv_extent = spread(map.inv_extent);
     const float* texels = (const float*)map.texels.data;
     const int resolution = map.resolution;
     const float scale = 0.5f * (float)(resolution - 1);
-    struct Law { F inv_o, inv_v, residual, cos_eye, cos_target; };
     // cubemap.project_to_cube
     auto project_to_cube = [&](V x) -> V {
         const F m = size(x);
@@ -202,6 +209,48 @@ REFLECTOR_MAP = r"""
         return fmin(fmin(gather(texels, at), gather(texels + 8, at)), fmin(gather(below, at), gather(below + 8, at)));
     };
     auto sample = [&](V x) -> Sample { return sample_cell(map_cell(x)); };
+    (void)sample; (void)least_mask;
+"""
+
+# After that, `map_search.is_visible`.
+IS_VISIBLE = r"""
+    const V white_eye = product(eye, inv_extent);
+    auto is_visible = [&](I asked, V target) __attribute__((always_inline)) -> I {
+        const V white = product(target, inv_extent);
+        const V d = sub(white, white_eye);
+        F t = clip(-dot(white_eye, d) / fmax(dot(d, d), F(1.0e-30f)), 0.0f, 1.0f);
+        const F nearest = length(add(white_eye, times(t, d)));
+        I visible = nearest > map.outer_radius;
+        I open = asked & ~visible & ~(nearest < map.inner_radius);
+        if (!bits(open)) return visible;
+        const V direction = sub(target, eye);
+        F low = F(0.0f), high = F(1.0f);
+        for (int k = 0; k < gauge_steps && bits(open); ++k) {
+            const V w = add(white_eye, times(t, d));
+            const Sample s = sample(project_to_cube(w));
+            open &= ~(length(w) < (1.0f + gauge_inside) * length(product(s.p, inv_extent)));
+            const V plane = cross(s.p_u, s.p_v);
+            const F height = dot(plane, s.p), side = pick(height < 0.0f, F(-1.0f), F(1.0f));
+            const F level = (1.0f + gauge_inside) * side * height;
+            const I before = open & (side * dot(plane, eye) > level) & (side * dot(plane, target) > level);
+            visible |= before;
+            open &= ~before;
+            const I falls = dot(s.n, direction) < 0.0f;
+            low = pick(falls, t, low);
+            high = pick(falls, high, t);
+            const I ended = open & ((low >= 1.0f) | (high <= 0.0f));
+            visible |= ended;
+            open &= ~ended;
+            t = 0.5f * (low + high);
+        }
+        return visible | open;
+    };
+    (void)is_visible;
+"""
+
+# After those samples, of `map_search`: `measure`, `newton_step`, `step_on_cube`.
+MAP_STEPS = r"""
+    struct Law { F inv_o, inv_v, residual, cos_eye, cos_target; };
     // reflector_maps.slide
     auto slide = [&](const Sample& s, F along_u, F along_v) -> Sample {
         Sample moved;
@@ -266,5 +315,5 @@ REFLECTOR_MAP = r"""
             cap = fmin(cap, step_cap * length(whitened) / fmax(length(move), F(1.0e-30f)));
         return project_to_cube(add(times(size(whitened), x), times(cap * shrink, move)));
     };
-    (void)slide; (void)sample; (void)least_mask;
+    (void)slide;
 """

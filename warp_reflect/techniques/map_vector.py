@@ -1,4 +1,4 @@
-"""The Newton search in a reflector map (`map_search.solve_vertex`) for a block of vertices at a time.
+"""The Newton search in a reflector map (`map_search.solve_vertex`) and what bounds the visible, many vertices at a time.
 
 The same steps with the same decisions in every lane. Visible vertices of a run are moved together first, and again where
 few of a vector's lanes go on and where searches that did not end near a root start from a coarse seed. The vectors of a run
@@ -13,7 +13,7 @@ import warp as wp
 from warp_reflect import vector
 from warp_reflect.layers import CameraView
 from warp_reflect.reflector_maps import ReflectorMapView
-from warp_reflect.techniques.lanes import REFLECTOR_MAP, VIRTUAL_VERTEX
+from warp_reflect.techniques.lanes import IS_VISIBLE, MAP_SAMPLES, MAP_STEPS, UNIT_FRAME, VIRTUAL_VERTEX
 from warp_reflect.techniques.map_search import (
     ACCEPTED,
     COARSE_NODES,
@@ -47,10 +47,11 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
     vector.snippet(
         vector.PACKED
         + VIRTUAL_VERTEX
-        + REFLECTOR_MAP
+        + MAP_SAMPLES
+        + IS_VISIBLE
+        + MAP_STEPS
         + r"""
     const int count = points.shape[0];
-    const V white_eye = product(eye, inv_extent);
     const F eye_height = fmax(length(white_eye) - 1.0f, F(1.0e-3f));
     // What is left to search, side by side, and a vector more for the last load: of a run, then of all runs.
     constexpr int ROWS = 8, RUN = ROWS * LANES, TASK = BLOCKS * BLOCK, RUNS = TASK / RUN;
@@ -99,36 +100,7 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
                 if (!bits(asked)) continue;
                 const V point = vrows((const float*)points.data, start, full, own);
                 const V target = add(matrix(frame.unit_from_scene, point), spread(frame.unit_offset));
-                // map_search.is_visible
-                const V white = product(target, inv_extent);
-                const V d = sub(white, white_eye);
-                F t = clip(-dot(white_eye, d) / fmax(dot(d, d), F(1.0e-30f)), 0.0f, 1.0f);
-                const F nearest = length(add(white_eye, times(t, d)));
-                I visible = nearest > map.outer_radius;
-                I open = asked & ~visible & ~(nearest < map.inner_radius);
-                if (bits(open)) {
-                    const V direction = sub(target, eye);
-                    F low = F(0.0f), high = F(1.0f);
-                    for (int k = 0; k < gauge_steps && bits(open); ++k) {
-                        const V w = add(white_eye, times(t, d));
-                        const Sample s = sample(project_to_cube(w));
-                        open &= ~(length(w) < (1.0f + gauge_inside) * length(product(s.p, inv_extent)));
-                        const V plane = cross(s.p_u, s.p_v);
-                        const F height = dot(plane, s.p), side = pick(height < 0.0f, F(-1.0f), F(1.0f));
-                        const F level = (1.0f + gauge_inside) * side * height;
-                        const I before = open & (side * dot(plane, eye) > level) & (side * dot(plane, target) > level);
-                        visible |= before;
-                        open &= ~before;
-                        const I falls = dot(s.n, direction) < 0.0f;
-                        low = pick(falls, t, low);
-                        high = pick(falls, high, t);
-                        const I ended = open & ((low >= 1.0f) | (high <= 0.0f));
-                        visible |= ended;
-                        open &= ~ended;
-                        t = 0.5f * (low + high);
-                    }
-                    visible |= open;
-                }
+                const I visible = is_visible(asked, target);
                 for (unsigned left = bits(asked & ~visible); left != 0; left &= left - 1) {
                     const int i = start + __builtin_ctz(left);
                     status[i] = (unsigned char)hidden;
@@ -144,6 +116,7 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
                 seed = project_to_cube(seed);
                 if (bits(asked & unknown)) {
                     // map_search.first_guess
+                    const V white = product(target, inv_extent);
                     const F height = fmax(length(white) - 1.0f, F(1.0e-3f));
                     const F share = height / (eye_height + height);
                     const V w = add(times(share, white_eye), times(1.0f - share, white));
@@ -470,3 +443,69 @@ def search_blocks_kernel(
         MAX_ITERATIONS,
         out_vertex,
     )
+
+
+@wp.func_native(
+    vector.snippet(
+        UNIT_FRAME
+        + MAP_SAMPLES
+        + IS_VISIBLE
+        + r"""
+    const int begin = block * BLOCK, count = edges.shape[0];
+    const int end = begin + BLOCK < count ? begin + BLOCK : count;
+    float* points_of = (float*)out_point.data;
+    for (int start = begin; start < end; start += LANES) {
+        const I element = start + lanes();
+        const I own = ipick(element < end, element, I(end - 1));
+        const int* ends = (const int*)edges.data;
+        const I from = igather(ends, 2 * own), to = igather(ends, 2 * own + 1);
+        const I asked = (element < end) & (from >= 0);
+        if (!bits(asked)) continue;
+        auto place = [&](I vertex) -> V {
+            const V point = vgather((const float*)points.data, ipick(asked, vertex, I(0)));
+            return add(matrix(frame.unit_from_scene, point), spread(frame.unit_offset));
+        };
+        const V a = place(from), along = sub(place(to), a);
+        F low = F(0.0f), high = F(1.0f);
+        for (int k = 0; k < steps; ++k) {
+            const F middle = 0.5f * (low + high);
+            const I visible = is_visible(asked, add(a, times(middle, along)));
+            low = pick(visible, middle, low);
+            high = pick(visible, high, middle);
+        }
+        const V last = matrix(frame.eye_from_unit, sub(add(a, times(low, along)), eye));
+        float lane[3][LANES];
+        store(lane[0], last.x); store(lane[1], last.y); store(lane[2], last.z);
+        for (unsigned left = bits(asked); left != 0; left &= left - 1) {
+            const int l = __builtin_ctz(left);
+            for (int k = 0; k < 3; ++k) points_of[3 * (start + l) + k] = lane[k][l];
+        }
+    }
+""",
+    )
+)
+def boundary_block(
+    block: int,
+    points: wp.array(dtype=wp.vec3),
+    map: ReflectorMapView,
+    frame: SolveFrame,
+    edges: wp.array(dtype=wp.vec2i),
+    steps: int,
+    gauge_steps: int,
+    gauge_inside: float,
+    out_point: wp.array(dtype=wp.vec3),
+): ...
+
+
+@wp.kernel
+def boundary_blocks_kernel(
+    first: int,
+    points: wp.array(dtype=wp.vec3),
+    map: ReflectorMapView,
+    frame: SolveFrame,
+    edges: wp.array(dtype=wp.vec2i),
+    steps: int,
+    out_point: wp.array(dtype=wp.vec3),
+):
+    """As `reflector_map.boundary_kernel`, one thread per block of edges."""
+    boundary_block(first + wp.tid(), points, map, frame, edges, steps, GAUGE_STEPS, GAUGE_INSIDE, out_point)

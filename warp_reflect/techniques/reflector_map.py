@@ -104,7 +104,7 @@ def search(
         launch(search_kernel, count, inputs, device, threads)
 
 
-@wp.kernel
+@wp.kernel(module=PLAIN)
 def boundary_kernel(
     first: int,
     points: wp.array(dtype=wp.vec3),
@@ -129,6 +129,33 @@ def boundary_kernel(
         else:
             high = middle
     out_point[i] = frame.eye_from_unit * (a + low * (b - a) - frame.eye)
+
+
+def boundary(
+    points: wp.array,
+    map: ReflectorMap,
+    frame: SolveFrame,
+    edges: wp.array,
+    steps: int,
+    out_point: wp.array,
+    device,
+    threads: int,
+    kernels: str,
+) -> None:
+    """The last visible point of each edge, see `boundary_kernel`.
+
+    Args:
+        points: vec3 [n], scene frame.
+        edges: vec2i, (visible vertex, vertex that is not); -1: none.
+        steps: Bisections.
+        out_point: vec3, eye frame.
+        kernels: `Settings.kernels`.
+    """
+    inputs = [points, map.view, frame, edges, steps, out_point]
+    if vector.chosen(kernels, device):
+        vector.launch_blocks(map_vector.boundary_blocks_kernel, len(edges), inputs, device, threads)
+    else:
+        launch(boundary_kernel, len(edges), inputs, device, threads)
 
 
 @dataclass
@@ -444,13 +471,8 @@ def reflect(
             solve(points[scene.vertex_count :], [0, 0], frame, warm, added)
 
     def solve_boundary(points, frame: SolveFrame, edges: wp.array, out_point: wp.array) -> None:
-        launch(
-            boundary_kernel,
-            len(edges),
-            [points, prepared.map.view, frame, edges, forward.BOUNDARY_STEPS[settings.refine], out_point],
-            scene.device,
-            settings.threads,
-        )
+        steps, run_on = forward.BOUNDARY_STEPS[settings.refine], (scene.device, settings.threads, settings.kernels)
+        boundary(points, prepared.map, frame, edges, steps, out_point, *run_on)
 
     layer = forward.reflect(
         scene,
