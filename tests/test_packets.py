@@ -495,6 +495,22 @@ def test_shadows_of_some_pixels_are_those_of_plain_kernels_in_whatever_order_the
             np.testing.assert_array_equal(got, plain)
 
 
+def test_distant_lights_alone_ask_for_starts_that_were_left_as_rays_to_shapes_had_them():
+    """Their rays need fewer rows, in memory that another picture's rays have filled."""
+    balls = [(ball_mesh(), place(0, 0.8, 0, 0.5), WHITE), (ball_mesh(), place(1, 0.5, 1, 0.4), WHITE)]
+    scene = scene_of([(ground(), place(), WHITE), *balls], LIGHTS[:2])
+    points = direct.points_of(
+        scene, raster.draw_scene(scene, look_at((0, 3.0, 4.0), (0, 0.3, 0), fov=50, size=(96, 64)))
+    )
+    cast = shadows.every_shadow(scene)
+    plain = shadows.shadowed_irradiance(scene, points, cast, 1, kernels="plain").numpy()
+    assert plain.any() and (plain == 0.0).any()
+    for _ in range(2):
+        got = shadows.shadowed_irradiance(scene, points, cast, 1, kernels="vector").numpy()
+        np.testing.assert_array_equal(got, plain)
+        shadows.sky_share(scene, points, 4, 1, kernels="vector")
+
+
 def test_lights_are_tried_one_by_one_bit_for_bit_as_the_plain_kernel_tries_them():
     scene, _ = lit_balls()
     camera = look_at((0, 1.0, 4.0), (0, 0.8, 0), fov=60, size=(67, 43))

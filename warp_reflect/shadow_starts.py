@@ -213,6 +213,7 @@ def starts_of(
     numbered: bool = False,
     kernels: str = "auto",
     room: wp.array | None = None,
+    shaped: bool = True,
 ) -> Starts:
     """Where the shadow rays of points start.
 
@@ -225,6 +226,8 @@ def starts_of(
         numbered: Samples are shifted by the points' numbers, as for points of no image.
         kernels: `Settings.kernels`.
         room: From `kept_room`, where the rows lie as long as it is; None: they have memory of their own.
+        shaped: Whether any of their rays go to shapes or the sky. Others ask neither for facets nor for the samples' shift, and
+            vector kernels leave those rows as they are.
     """
     device, count = scene.device, len(points.triangle)
     if normals is None:
@@ -237,7 +240,7 @@ def starts_of(
     if vector.chosen(kernels, device):
         from warp_reflect import shadow_starts_vector  # which fills this module's rows
 
-        shadow_starts_vector.starts_of(scene, points, normals, starts, width, threads, room)
+        shadow_starts_vector.starts_of(scene, points, normals, starts, width, threads, room, shaped)
         return starts
     at = [points.triangle, points.u, points.v, points.direction, normals, points.pixel, width]
     launch(starts_kernel, count, [scene.view, scene.lights.direct, *at, starts], device, threads)

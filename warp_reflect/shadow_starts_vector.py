@@ -50,7 +50,7 @@ FLAT = module_part(__name__, "flat")
         const I seen = known >= 0;
         auto keep = [&](int row, F value) { store(rows + row * stride + start, pick(seen, value, F(0.0f))); };
         if (!bits(seen)) {
-            for (int row = 0; row < out_rows.shape[0]; ++row) store(rows + row * stride + start, F(0.0f));
+            for (int row = 0; row < (shaped != 0 ? out_rows.shape[0] : 6); ++row) store(rows + row * stride + start, F(0.0f));
             for (int k = 0; k < area_count; ++k) store(out_unshadowed.data + k * stride + start, F(0.0f));
             continue;
         }
@@ -107,6 +107,7 @@ FLAT = module_part(__name__, "flat")
         p = add(p, times(fmax(offset(p0), fmax(offset(p1), offset(p2))), side));
         keep(0, p.x); keep(1, p.y); keep(2, p.z);
         keep(3, n.x); keep(4, n.y); keep(5, n.z);
+        if (shaped == 0) continue;
         keep(6, side.x); keep(7, side.y); keep(8, side.z);
         if (width > 0) {
             keep(9, noise(column, line));
@@ -142,6 +143,7 @@ def start_block(
     normals: wp.array(dtype=wp.vec3),
     pixel: wp.array(dtype=int),
     width: int,
+    shaped: int,
     shape_quadric: int,
     sphere: int,
     offset_share: float,
@@ -165,11 +167,15 @@ def starts_blocks_kernel(
     normals: wp.array(dtype=wp.vec3),
     pixel: wp.array(dtype=int),
     width: int,
+    shaped: int,
     # Outputs:
     out_rows: wp.array2d(dtype=float),
     out_unshadowed: wp.array2d(dtype=float),
 ):
-    """One thread per block of points; those of the eye have weights and rays of length 0."""
+    """One thread per block of points; those of the eye have weights and rays of length 0.
+
+    Not `shaped`: no more than rays to distant lights need, which ask neither for facets nor for samples.
+    """
     start_block(
         first + wp.tid(),
         of_eye,
@@ -184,6 +190,7 @@ def starts_blocks_kernel(
         normals,
         pixel,
         width,
+        shaped,
         SHAPE_QUADRIC,
         SPHERE,
         OFFSET_ULPS * FLOAT_EPS,
@@ -226,6 +233,7 @@ def starts_of(
     width: int,
     threads: int,
     room: wp.array | None = None,
+    shaped: bool = True,
 ) -> None:
     """What `shadow_starts.starts_kernel` does; see `shadow_starts.starts_of`."""
     device, count = scene.device, len(points.triangle)
@@ -236,7 +244,7 @@ def starts_of(
         rows = rows_in(room, int(ROWS) + PLACE_ROWS, rows.shape[1], device)
         starts.rows = rows
     camera = _no_camera(str(device)) if points.camera is None else points.camera
-    at = [points.triangle, points.u, points.v, points.direction, normals, points.pixel, width]
+    at = [points.triangle, points.u, points.v, points.direction, normals, points.pixel, width, int(shaped)]
     inputs = [int(points.camera is not None), scene.view, scene.triangle_records, camera, lights, *at]
     vector.launch_blocks(starts_blocks_kernel, count, [*inputs, rows, starts.unshadowed], device, threads)
     if flat:

@@ -456,7 +456,9 @@ def shadowed_irradiance(
 
         send, mesh = shadows_vector.irradiance, wp.uint64(scene.shadow_tracer.packets)
     with kept_room(scene, count) as room:
-        starts = starts_of(scene, points, normals, len(areas), threads, kernels=kernels, room=room)
+        starts = starts_of(
+            scene, points, normals, len(areas), threads, kernels=kernels, room=room, shaped=len(areas) > 0
+        )
         send(mesh, lights, [distant, areas], starts, count, samples, around, result, threads)
     return result
 
