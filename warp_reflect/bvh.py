@@ -30,8 +30,8 @@ from warp_reflect.trees import Tree, resting_tree
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": FINITE_FLAGS})
 NONE = wp.constant(int(Status.NONE))
-FREE, OWN, ONWARD, BOUNCED = (
-    launch.module_part(__name__, name, cpu_compiler_flags=FINITE_FLAGS) for name in ("free", "own", "onward", "bounced")
+FREE, OWN, ONWARD = (
+    launch.module_part(__name__, name, cpu_compiler_flags=FINITE_FLAGS) for name in ("free", "own", "onward")
 )
 
 # Rays for each triangle of a scene that moves, from which on their packets save what fitting the wide tree at another time
@@ -109,6 +109,7 @@ def trace_pixels_kernel(
     index: wp.array(dtype=int),
     indexed: int,
     known: int,
+    twice: int,
     status: wp.array(dtype=wp.uint8),
     # Outputs:
     out_triangle: wp.array(dtype=int),
@@ -117,11 +118,12 @@ def trace_pixels_kernel(
     out_distance: wp.array(dtype=float),
     out_status: wp.array(dtype=wp.uint8),
 ):
-    """One thread per asked mirror pixel; nothing is written where its number is -1.
+    """One thread per asked mirror pixel, of which nothing is written where its number is -1; or per ray, without pixels.
 
-    `bodies` are those of patches; of length 0: `body` is all pixels' own. `known` is 1 for what `bvh_vector.first_met` has left.
-    With a `status` a miss beside a hit, or without a neighbour, is asked again: a kernel of its own would be compiled for as long
-    as this one.
+    A ray's facet is `facets`' own; one without a facet meets nothing. `bodies` are those of patches; of length 0: `body` is all
+    pixels' own. `known` is 1 for what `bvh_vector.first_met` has left. Rays that meet nothing are turned and asked `twice`. With
+    a `status` a miss beside a hit, or without a neighbour, is asked again. Kernels of their own would each be compiled for as
+    long as this one.
     """
     row, _ = wp.tid()
     i = first + row
@@ -129,11 +131,25 @@ def trace_pixels_kernel(
         i = index[i]
         if i < 0:
             return
-    if pixel[i] < 0:
-        return
+    facet = int(-1)
+    if pixel.shape[0] > 0:
+        if pixel[i] < 0:
+            return
+        facet = facets[pixel[i]]
+    else:
+        facet = facets[i]
+        if facet < 0:
+            out_triangle[i] = -1
+            out_u[i] = 0.0
+            out_v[i] = 0.0
+            out_distance[i] = 0.0
+            out_status[i] = wp.uint8(NONE)
+            return
     retry = status.shape[0]
     ray = direction[i]
-    own = body_at(scene, facets, pixel, body, bodies, i)
+    own = body
+    if bodies.shape[0] > 0:
+        own = bodies[scene.triangle_patch[facet]]
     if retry != 0:
         if int(status[i]) != SKY:
             return
@@ -153,7 +169,7 @@ def trace_pixels_kernel(
             return
         ray = moved_direction(ray)
     met = answered(known, out_triangle[i], out_u[i], out_v[i], out_distance[i])
-    hit = trace_ray_from(mesh_id, scene, point[i], ray, normal[i], facets[pixel[i]], own, 0, 0.0, met)
+    hit = trace_ray_from(mesh_id, scene, point[i], ray, normal[i], facet, own, twice, 0.0, met)
     if retry != 0 and hit.status == SKY:
         return
     out_triangle[i] = hit.triangle
@@ -211,47 +227,6 @@ def trace_onward_kernel(
             return
     met = answered(known, out_triangle[i], out_u[i], out_v[i], out_distance[i])
     hit = trace_onward(mesh_id, scene, point[i], direction[i], normal[i], facet[i], int(inside[i]), 0.0, met)
-    out_triangle[i] = hit.triangle
-    out_u[i] = hit.u
-    out_v[i] = hit.v
-    out_distance[i] = hit.t
-    out_status[i] = wp.uint8(hit.status)
-
-
-@wp.kernel(module=BOUNCED)
-def trace_bounced_kernel(
-    first: int,
-    mesh_id: wp.uint64,
-    scene: SceneView,
-    facet: wp.array(dtype=int),
-    point: wp.array(dtype=wp.vec3),
-    normal: wp.array(dtype=wp.vec3),
-    direction: wp.array(dtype=wp.vec3),
-    bodies: wp.array(dtype=OwnBody),
-    index: wp.array(dtype=int),
-    indexed: int,
-    known: int,
-    # Outputs:
-    out_triangle: wp.array(dtype=int),
-    out_u: wp.array(dtype=float),
-    out_v: wp.array(dtype=float),
-    out_distance: wp.array(dtype=float),
-    out_status: wp.array(dtype=wp.uint8),
-):
-    """One thread per asked ray; known 1: what `bvh_vector.first_met` has left. A ray without a facet meets nothing."""
-    i = first + wp.tid()
-    if indexed != 0:
-        i = index[i]
-    if facet[i] < 0:
-        out_triangle[i] = -1
-        out_u[i] = 0.0
-        out_v[i] = 0.0
-        out_distance[i] = 0.0
-        out_status[i] = wp.uint8(NONE)
-        return
-    body = bodies[scene.triangle_patch[facet[i]]]
-    met = answered(known, out_triangle[i], out_u[i], out_v[i], out_distance[i])
-    hit = trace_ray_from(mesh_id, scene, point[i], direction[i], normal[i], facet[i], body, 1, 0.0, met)
     out_triangle[i] = hit.triangle
     out_u[i] = hit.u
     out_v[i] = hit.v
@@ -458,12 +433,12 @@ def _trace(
     known, left, missed = _first_met(scene, tracer, layer, start, leaving, index, False, threads, kernels, width)
     if left:
         some = _with_status(layer, index, Status.NONE) if known else asked
-        inputs = [*rays, *some, known, compact.none(wp.uint8, scene.device), *outputs]
+        inputs = [*rays, *some, known, 0, compact.none(wp.uint8, scene.device), *outputs]
         launch.launch(trace_pixels_kernel, len(some[0]), inputs, scene.device, threads, split_min=TRACE_SPLIT_MIN)
     if left or missed:
         some = _with_status(layer, index, Status.SKY) if known else asked
         # The neighbours' answers are read from a copy, so that the order of threads cannot matter.
-        inputs = [*rays, *some, 0, wp.clone(layer.status), *outputs]
+        inputs = [*rays, *some, 0, 0, wp.clone(layer.status), *outputs]
         launch.launch(trace_pixels_kernel, len(some[0]), inputs, scene.device, threads, split_min=TRACE_SPLIT_MIN)
     if scene.has_hole is not None:
         own = {"body": leaving[0][1]} if not len(bodies) else {"bodies": bodies}
@@ -602,9 +577,10 @@ def trace_bounced(
     if left:
         some = _with_status(layer, None, Status.NONE) if known else [facet, 0]
         count = len(some[0]) if known else pixels.count
-        inputs = [wp.uint64(scene.tracer.id), scene.view, facet, pixels.point, pixels.normal, pixels.direction]
-        inputs += [bodies, *some, known, layer.triangle, layer.u, layer.v, layer.distance, layer.status]
-        launch.launch(trace_bounced_kernel, count, inputs, scene.device, threads, split_min=TRACE_SPLIT_MIN)
+        inputs = [wp.uint64(scene.tracer.id), scene.view, *start[:2], pixels.point, pixels.normal, pixels.direction]
+        inputs += [OwnBody(), bodies, *some, known, 1, compact.none(wp.uint8, scene.device)]
+        inputs += [layer.triangle, layer.u, layer.v, layer.distance, layer.status]
+        launch.launch(trace_pixels_kernel, count, inputs, scene.device, threads, split_min=TRACE_SPLIT_MIN)
     if scene.has_hole is not None:
         _past_holes(scene, layer, scene.tracer, facet, bodies=bodies, threads=threads)
 

@@ -44,7 +44,7 @@ ROWS = {
     "raytraced": ("bvh", "|wide_tree", "|bvh_vector"),
     "refinement": ("|raster_rays_vector", "|techniques.refine_vector", "-techniques.refine"),
     "grid": ("techniques.interpolation",),
-    "second_bounce": ("bounces", "-bvh/bounced"),
+    "second_bounce": ("bounces", "-bvh"),
     "clearcoat": ("finishes.coat",),
     "fade": ("finishes.fade",),
 }
