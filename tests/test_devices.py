@@ -12,10 +12,19 @@ from warp_reflect.layers import pixel_bounds
 
 ASKED = """
 import resource
+import sys
 import numpy as np
-from warp_reflect.devices import open_device
 
-open_device("cpu")
+if sys.argv[1] == "command":
+    from warp_reflect.devices import open_device
+
+    open_device("cpu")
+elif sys.argv[1] == "library":
+    import warp_reflect as wr
+
+    wr.keep_freed_memory()
+else:
+    import warp_reflect.frame
 faults = []
 for _ in range(6):
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
@@ -26,11 +35,11 @@ print(min(faults[2:]))
 """
 
 
-def pages_asked_for(**environment):
+def pages_asked_for(way="command", **environment):
     """Pages that a process asks the system for when it makes 80 MB of arrays as it has before."""
     inherited = {name: value for name, value in os.environ.items() if name not in ALLOCATOR_VARIABLES}
     found = subprocess.run(
-        [sys.executable, "-c", ASKED], env=inherited | environment, capture_output=True, text=True, check=True
+        [sys.executable, "-c", ASKED, way], env=inherited | environment, capture_output=True, text=True, check=True
     )
     return int(found.stdout.split()[-1])
 
@@ -39,6 +48,8 @@ def test_freed_arrays_stay_with_the_process_unless_its_user_says_otherwise():
     if not hasattr(ctypes.CDLL(None), "mallopt"):
         return  # another C library, which is left alone
     assert pages_asked_for() < 100
+    assert pages_asked_for("library") < 100
+    assert pages_asked_for("nothing") > 1000
     assert pages_asked_for(MALLOC_TRIM_THRESHOLD_="131072") > 1000
 
 

@@ -25,6 +25,7 @@ _HOME = {
     "Technique": "settings",
     "capture_frame": "captured",
     "compare_frames": "metrics",
+    "keep_freed_memory": "devices",
     "load_stage": "stage.load",
     "make_plan": "planner",
     "refract": "refraction",
