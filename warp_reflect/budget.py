@@ -20,61 +20,63 @@ class Costs:
     `calibration.measure` finds them for another machine. Ratios between them decide, and those vary less.
     """
 
-    trace: float = 0.53
+    trace: float = 0.5
     """A ray for itself through a BVH of `TRACE_BASE` triangles; grows with their logarithm. Of a mirror's own: see `packed`."""
-    mirrored: float = 0.16
+    mirrored: float = 0.06
     """A vertex mirrored in a plane."""
-    quadric_cold: float = 0.2
+    quadric_cold: float = 0.08
     """A vertex solved on a quadric, from nothing, boxes and the rest of a search's step included."""
-    quadric_warm: float = 0.1
+    quadric_warm: float = 0.075
     """The same from the last frame's answer."""
-    map_cold: float = 0.23
+    map_cold: float = 0.09
     """A vertex solved in a map, from nothing."""
-    map_warm: float = 0.11
+    map_warm: float = 0.09
     """The same from the last frame's answer."""
-    branches: float = 7.0
+    branches: float = 5.3
     """A vertex whose every reflection point on a concave side is searched."""
-    bent: float = 0.5
+    bent: float = 0.2
     """A vertex of the scene on a frame that cuts anew: its edges are looked at, whether they bend, its triangles listed anew."""
-    cut: float = 0.27
+    cut: float = 0.11
     """A virtual vertex added where they do."""
-    draw: float = 0.11
+    draw: float = 0.023
     """A virtual triangle, the clipping at the hidden boundary included."""
-    covered: float = 0.05
+    covered: float = 0.026
     """A mirror pixel that virtual triangles are drawn into, those included that others hide."""
-    interpolated: float = 0.33
+    interpolated: float = 0.2
     """A vertex interpolated from a grid."""
-    candidate: float = 0.12
+    candidate: float = 0.053
     """A mirror pixel that shows its candidate, unrefined."""
-    refined: float = 0.09
+    refined: float = 0.055
     """A mirror pixel whose candidate is tested."""
-    own_body: float = 0.38
+    own_body: float = 0.32
     """A pixel of a mirror that may see itself."""
-    looked_up: float = 0.083
+    looked_up: float = 0.063
     """A mirror pixel that is looked up in a map of its environment: one bilinear look-up in a cube."""
-    map_texel: float = 0.12
+    map_texel: float = 0.073
     """A texel of an environment map that is drawn: its ray, its shading."""
-    map_triangle: float = 0.05
+    map_triangle: float = 0.019
     """A triangle of the scene, for every face of such a map."""
     blended: float = 0.13
     """A texel of a local map and one of its reference maps: the depth test, the look-up."""
-    followed: float = 1.0
+    followed: float = 0.8
     """A mirror pixel that is followed to what a local map holds, and looked up there."""
-    eye_triangle: float = 0.045
+    eye_triangle: float = 0.03
     """A triangle in the eye's own view."""
-    eye_pixel: float = 0.065
+    eye_pixel: float = 0.012
     """A pixel of the picture: drawn, its mirror found, shaded."""
-    mirror_pixel: float = 0.32
+    mirror_pixel: float = 0.065
     """A mirror pixel: its point and normal, and the shading of what it shows."""
-    gathered: float = 1.25
+    gathered: float = 0.83
     """A ray of a rough mirror's lobe, beyond following it and its shadows: drawn, shaded, shared with neighbours."""
-    through: float = 0.4
+    through: float = 0.061
     """A ray behind a transparent surface, beyond its shadows: bent, followed, shaded, added."""
-    shadow: float = 0.25
+    shadow: float = 0.095
     """A ray towards a light through `TRACE_BASE` triangles, that only asks whether anything is in the way, the rest of
     shadowing included."""
-    layer: float = 900.0
+    layer: float = 240.0
     """A reflector: what does not depend on counts."""
+    forward: float = 3800.0
+    """The same of one that is reflected forward, which takes some more steps: 2 to 6 ms in this package's scenes."""
     sharing: float = 0.83
     """Of a further thread, how much it adds to the first."""
 
@@ -83,7 +85,7 @@ BUILT_IN = Costs()
 # Likewise of a CUDA device, all of its threads together: an NVIDIA H100. What the host does one launch after the other is
 # `layer`; what it still does for every vertex of a mesh that is made or cut anew makes those dear.
 ON_CUDA = Costs(
-    trace=0.0019,
+    trace=0.004,
     mirrored=0.05,
     quadric_cold=0.073,
     quadric_warm=0.002,
@@ -106,23 +108,23 @@ ON_CUDA = Costs(
     eye_triangle=0.0006,
     eye_pixel=0.0003,
     mirror_pixel=0.0013,
-    gathered=0.0012,
+    gathered=0.0003,
     through=0.0009,
     shadow=0.0005,
     layer=364.0,
+    forward=1456.0,
 )
 TRACE_BASE = 65536  # triangles at which `Costs.trace` is told
 # A mirror's own rays go through the tree side by side, the cheaper the more of them meet the same triangles: at least this
-# share of `Costs.trace`, and more by the root of triangles per mirror pixel. Measured on this package's scenes, 5 * 10^3 to
-# 1.6 * 10^5 triangles by 10^3 to 3 * 10^5 pixels a mirror; beyond the last factor fixed costs hide the rest.
-PACKED_LEAST, PACKED_ROOT, PACKED_MOST = 0.15, 0.2, 1.3
+# share of `Costs.trace`, and more by the root of triangles per mirror pixel. Measured (`tools/bench_crossing.py`) over 10^4 to
+# 10^6 triangles by 10^3 to 10^6 pixels of a mirror; beyond the last factor packets of rays that have nothing in common go
+# through a tree that no cache holds.
+PACKED_LEAST, PACKED_ROOT, PACKED_MOST = 0.05, 0.135, 2.8
 # Rays of a pixel of a rough mirror that are followed, by `effects.glossy_way`: `SAMPLES` of `finishes.glossy_gather` and of
 # `glossy_rays`, whose import would build Warp's modules before they are asked for.
 GLOSSY_RAYS = {"gather": 6, "accumulate": 256, "filter": 0, "prefiltered": 0, "off": 0}
 LOOKS = 16  # look-ups of what follows no ray that cost as much as a gathered ray's
 BOUNCE_LAYERS = 3.0  # of `Costs.layer`: a mirror that shows mirrors, beyond its rays; measured: 2.2 to 3 ms a mirror
-# Of `Costs.layer`: a mirror that is reflected forward takes some more steps; measured: 2 to 5 ms a mirror.
-FORWARD_LAYERS = 4.0
 # Of a hollow mirror the middles of cut edges and what is added are searched branch by branch.
 BRANCH_ADDED = 2.0
 COLD_SHARE = 0.1  # of frames that start from nothing: of those of a walk few do, a single picture does
@@ -353,7 +355,7 @@ def _microseconds(work: Work, technique: str, settings: Settings, costs: Costs) 
         return shown, shown + local
     added = 0.0 if technique == "planar" else _added(work, settings)
     cold, warm = _search(work.vertices, added, technique, settings, costs)
-    every = FORWARD_LAYERS * costs.layer + (work.triangles + added) * costs.draw + work.pixels * costs.covered
+    every = costs.forward + (work.triangles + added) * costs.draw + work.pixels * costs.covered
     every += work.pixels * costs.candidate if settings.refine == "off" else _refined(work.pixels, settings, ray, costs)
     cut = work.vertices * costs.bent + added * costs.cut if added else 0.0
     warm = work.passes * (every + warm)
