@@ -312,11 +312,11 @@ def spent_on(plan, view=1.0, **techniques):
 
 
 def walked(scene, budget, frames, **machine):
-    """(plans, times) of frames on a machine, each planned after the one before."""
-    plans, spent = [planned(scene, budget_ms=budget)], []
+    """(plans, times) of frames on a machine, each planned after the one before; by a CPU's costs, where ways differ."""
+    plans, spent = [planned(scene, costs=BUILT_IN, budget_ms=budget)], []
     for _ in range(frames):
         spent.append(spent_on(plans[-1], **machine))
-        plans.append(keep_pace(planned(scene, budget_ms=budget), plans[-1], spent[-1]))
+        plans.append(keep_pace(planned(scene, costs=BUILT_IN, budget_ms=budget), plans[-1], spent[-1]))
     return plans[:-1], [each.ms for each in spent]
 
 
@@ -329,8 +329,8 @@ def test_steady_times_change_nothing(ball_room):
 
 def test_late_frames_make_the_next_ones_cheaper_and_quality_does_not_flicker(ball_room):
     """A machine three times as slow as predicted: the plans settle, within the time, and then stay."""
-    front = choice.frontier(*planned(ball_room, budget_ms=1.0)._ways.values())
-    budget = 3.3 * (planned(ball_room).fixed_ms + front[0].ms)
+    front = choice.frontier(*planned(ball_room, costs=BUILT_IN, budget_ms=1.0)._ways.values())
+    budget = 3.3 * (planned(ball_room, costs=BUILT_IN).fixed_ms + front[0].ms)
     assert len(front) > 1
     plans, spent = walked(ball_room, budget, 12, view=3.0)
     assert spent[0] > 1.05 * budget, "the first plan has to be too dear for this to test anything"
@@ -341,8 +341,8 @@ def test_late_frames_make_the_next_ones_cheaper_and_quality_does_not_flicker(bal
 
 def test_early_frames_make_the_next_ones_more_accurate(ball_room):
     """A machine three times as fast as predicted: the first plan spares what there is time for."""
-    front = choice.frontier(*planned(ball_room, budget_ms=1.0)._ways.values())
-    budget = planned(ball_room).fixed_ms + front[0].ms
+    front = choice.frontier(*planned(ball_room, costs=BUILT_IN, budget_ms=1.0)._ways.values())
+    budget = planned(ball_room, costs=BUILT_IN).fixed_ms + front[0].ms
     plans, spent = walked(ball_room, budget, 8, view=1.0 / 3.0)
     assert plans[-1].loss < plans[0].loss and max(spent) <= 1.05 * budget
     assert all(same_choice(plan, plans[3]) for plan in plans[3:])

@@ -8,10 +8,15 @@ from rooms import placed, room, sphere
 
 import warp_reflect as wr
 from warp_reflect import calibrate, calibration, cli
-from warp_reflect.budget import BUILT_IN, Costs
+from warp_reflect.budget import Costs
 from warp_reflect.scene import Scene
 
-OTHER = dataclasses.replace(BUILT_IN, trace=3.0 * BUILT_IN.trace, draw=0.5 * BUILT_IN.draw)
+
+@pytest.fixture
+def other(device):
+    """Costs that are not those of the device's kind, and could be measured on one."""
+    usual = calibration.built_in(device)
+    return dataclasses.replace(usual, trace=3.0 * usual.trace, draw=0.5 * usual.draw)
 
 
 @pytest.fixture
@@ -21,26 +26,26 @@ def kept(monkeypatch, tmp_path):
     return file
 
 
-def test_kept_costs_come_back_and_plans_go_by_them(kept, device):
+def test_kept_costs_come_back_and_plans_go_by_them(kept, device, other):
     assert calibration.known(device) == calibration.built_in(device)
-    assert calibration.store(OTHER, device) == kept
-    assert calibration.known(device) == OTHER
-    scene = Scene(room(sphere(), placed(0, 0, 0)).data, device)
-    plans = [wr.make_plan(scene, size=(160, 90), method="reference", costs=costs) for costs in (None, OTHER, BUILT_IN)]
-    assert plans[0].costs == OTHER and plans[0].predicted == plans[1].predicted != plans[2].predicted
-    calibration.store(BUILT_IN, device)
+    assert calibration.store(other, device) == kept
+    assert calibration.known(device) == other
+    scene, usual = Scene(room(sphere(), placed(0, 0, 0)).data, device), calibration.built_in(device)
+    plans = [wr.make_plan(scene, size=(160, 90), method="reference", costs=costs) for costs in (None, other, usual)]
+    assert plans[0].costs == other and plans[0].predicted == plans[1].predicted != plans[2].predicted
+    calibration.store(usual, device)
     assert calibration.known(device) == calibration.built_in(device)
     assert [file.name for file in kept.parent.iterdir()] == [kept.name]  # no temporary is left
 
 
-def test_costs_of_another_machine_or_version_are_not_taken(kept, device, monkeypatch):
-    calibration.store(OTHER, device)
+def test_costs_of_another_machine_or_version_are_not_taken(kept, device, other, monkeypatch):
+    calibration.store(other, device)
     for name, value in (("processor", lambda: "another"), ("__version__", "0.0")):
         with monkeypatch.context() as changed:
             changed.setattr(calibration, name, value)
             assert calibration.known(device) == calibration.built_in(device)
-            calibration.store(dataclasses.replace(OTHER, layer=1.0), device)
-    assert calibration.known(device) == OTHER, "the other machines' costs lie beside it"
+            calibration.store(dataclasses.replace(other, layer=1.0), device)
+    assert calibration.known(device) == other, "the other machines' costs lie beside it"
     assert len(json.loads(kept.read_text())) == 3
 
 
@@ -56,8 +61,8 @@ def test_costs_of_another_machine_or_version_are_not_taken(kept, device, monkeyp
         lambda entry: entry.update(trace=1e9),
     ],
 )
-def test_damaged_costs_are_not_believed(damage, kept, device):
-    calibration.store(OTHER, device)
+def test_damaged_costs_are_not_believed(damage, kept, device, other):
+    calibration.store(other, device)
     entries = json.loads(kept.read_text())
     (entry,) = entries.values()
     damage(entry["microseconds"])
@@ -67,12 +72,12 @@ def test_damaged_costs_are_not_believed(damage, kept, device):
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"x": 1}', "\x00\xff"])
-def test_files_that_are_none_are_no_calibration_and_are_replaced(text, kept, device):
+def test_files_that_are_none_are_no_calibration_and_are_replaced(text, kept, device, other):
     kept.parent.mkdir()
     kept.write_text(text)
     assert calibration.known(device) == calibration.built_in(device)
-    calibration.store(OTHER, device)
-    assert calibration.known(device) == OTHER
+    calibration.store(other, device)
+    assert calibration.known(device) == other
 
 
 def test_the_file_lies_in_the_users_cache(monkeypatch, tmp_path):
