@@ -18,9 +18,9 @@ from functools import cached_property
 import warp as wp
 
 from warp_reflect import launch, surface
-from warp_reflect.effects import FINISHES
 from warp_reflect.frame import Frame, render_frame
 from warp_reflect.layers import Camera, ReflectionLayer
+from warp_reflect.plan_rows import PlanRow
 from warp_reflect.planner import Plan, find_camera
 from warp_reflect.scene import Scene
 from warp_reflect.timing import StageTimer
@@ -128,18 +128,30 @@ def why_not(scene: Scene, plan: Plan) -> str:
         return "the device has no memory pool, without which a graph cannot ask for memory"
     if scene.triangle_count == 0:
         return "the scene has no triangles"
-    if scene.has_hole is not None:
-        return "behind holes of cut-outs rays go on that are listed first"
     if plan.panes:
         return f"what is seen through {plan.panes[0].name} is followed by rays that are listed first"
     for row in plan.rows:
         if row.technique != "raytraced":
             return f"{row.name} is solved by {row.technique}, and is drawn where it is seen; method=reference traces it"
-        for name in FINISHES:
-            if row.effects[name].on:
-                return f"{row.name} has {name}, whose rays are listed first"
+        asked = looked_up(row)
+        if asked:
+            return f"{row.name} is looked up where it is seen in a picture of itself; {asked} asks rays"
         if row.effects["second_bounce"].numbers.get("solved"):
             return f"{row.name} shows mirrors that are solved from the eye behind it; method=reference traces them"
+    return ""
+
+
+def looked_up(row: PlanRow) -> str:
+    """The setting that would follow rays where a finish of a mirror looks them up in its picture; empty where none does."""
+    bumpy = row.effects["normal_map"].on
+    if bumpy and row.settings.bumps != "traced":
+        return "bumps=traced"
+    if row.effects["waves"].on and not bumpy and row.settings.waves != "traced":
+        return "waves=traced"
+    if row.effects["roughness"].numbers.get("way") == "filter" and (
+        row.effects["roughness"].on or row.effects["clearcoat"].on
+    ):
+        return "glossy=gather"
     return ""
 
 

@@ -268,6 +268,11 @@ class MirrorPixels:
         """The first of the entries that have a pixel, and their end, where they are `run`; read now."""
         return tuple(self.run.numpy()[:2].tolist())
 
+    def turned(self, direction: wp.array, normal: wp.array | None = None) -> MirrorPixels:
+        """The same pixels with rays that go elsewhere, and with normals that would send them there."""
+        normal = self.normal if normal is None else normal
+        return MirrorPixels(self.reflector, self.pixel, self.point, normal, direction, self.box, run=self.run)
+
     def follows(self, other: MirrorPixels) -> bool:
         """Whether they lie right behind another reflector's, as far as there are any."""
         if self.run is not None:

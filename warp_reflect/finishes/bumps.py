@@ -45,8 +45,11 @@ def turn_rays_kernel(
     direction: wp.array(dtype=wp.vec3),
     out_direction: wp.array(dtype=wp.vec3),
 ):
-    """One thread per mirror pixel."""
+    """One thread per mirror pixel; no direction where the number is -1."""
     i = first + wp.tid()
+    if pixel[i] < 0:
+        out_direction[i] = wp.vec3(0.0, 0.0, 0.0)
+        return
     out_direction[i] = turned_reflection(direction[i], normal[i], shown_normal(normals, pixel[i], normal[i]))
 
 
@@ -105,7 +108,7 @@ def turned_radiance(scene: Scene, shown: shade.Shown, layer: ReflectionLayer, ra
     direction = wp.empty(pixels.count, dtype=wp.vec3, device=device)
     inputs = [shown.normals, pixels.pixel, pixels.normal, pixels.direction, direction]
     launch.launch(turn_rays_kernel, pixels.count, inputs, device, threads)
-    turned = MirrorPixels(pixels.reflector, pixels.pixel, pixels.point, pixels.normal, direction, pixels.box)
+    turned = pixels.turned(direction)
     if row.settings.bumps == "traced":
         return _traced(scene, shown, layer, turned, row)
     width = shown.gbuffer.camera.size[0]
@@ -125,7 +128,7 @@ def turned_radiance(scene: Scene, shown: shade.Shown, layer: ReflectionLayer, ra
 
 def _traced(scene: Scene, shown: shade.Shown, layer: ReflectionLayer, turned: MirrorPixels, row) -> wp.array:
     """What rays see that start on a mirror's pixels."""
-    answer = ReflectionLayer.empty(turned, layer.method, scene.device)
+    answer = ReflectionLayer.unset(turned, layer.method, scene.device)
     part, convex = row.reflector.part, row.reflector.convex
     how = {"threads": row.settings.threads, "kernels": row.settings.kernels}
     bvh.trace_pixels(scene, shown.gbuffer, turned, answer, part, convex, **how)

@@ -37,9 +37,11 @@ def mix_coat_kernel(
     coat: wp.array(dtype=wp.vec3),
     out_radiance: wp.array(dtype=wp.vec3),
 ):
-    """One thread per mirror pixel."""
+    """One thread per mirror pixel, but for the number -1."""
     i = first + wp.tid()
     p = pixel[i]
+    if p < 0:
+        return
     look = Look()
     if looks.shape[0] > 0:
         look = looks[p]
@@ -71,7 +73,7 @@ def apply(
         coat = bumps.turned_radiance(scene, shown, layer, sharp, row)
     else:
         coat = sharp
-    mixed = wp.zeros(pixels.count, dtype=wp.vec3, device=device)
+    mixed = wp.empty(pixels.count, dtype=wp.vec3, device=device)
     inputs = [scene.view, shown.looks, shown.normals, shown.gbuffer.triangle, pixels.pixel, pixels.normal]
     launch.launch(
         mix_coat_kernel, pixels.count, [*inputs, pixels.direction, radiance, coat, mixed], device, settings.threads

@@ -81,8 +81,10 @@ def number_at(around: Neighbours, x: int, y: int) -> int:
 
 @wp.kernel
 def number_kernel(first: int, pixel: wp.array(dtype=int), out_around: Neighbours):
-    """One thread per mirror pixel."""
+    """One thread per mirror pixel, but for the number -1."""
     i = first + wp.tid()
+    if pixel[i] < 0:
+        return
     place = box_row(out_around, pixel[i]) * out_around.width + box_column(out_around, pixel[i])
     out_around.number[place] = i
 
@@ -164,9 +166,11 @@ def gather_kernel(
     neighbour_count: int,
     out_radiance: wp.array(dtype=wp.vec3),
 ):
-    """One thread per mirror pixel."""
+    """One thread per mirror pixel, but for the number -1."""
     i = first + wp.tid()
     p = pixel[i]
+    if p < 0:
+        return
     column = box_column(around, p)
     row = box_row(around, p)
     view = eye_side(direction[i], normal[i])
@@ -228,9 +232,11 @@ def smooth_kernel(
     width: float,
     out_radiance: wp.array(dtype=wp.vec3),
 ):
-    """One thread per mirror pixel; `width` is the Gaussian's, over alpha."""
+    """One thread per mirror pixel, but for the number -1; `width` is the Gaussian's, over alpha."""
     i = first + wp.tid()
     p = pixel[i]
+    if p < 0:
+        return
     column = box_column(around, p)
     row = box_row(around, p)
     lobe = surface_lobe(scene, looks, p, triangle[p], coat)

@@ -21,7 +21,7 @@ from warp_reflect.finishes.lobe import (
     share_of_weight,
     surface_lobe,
 )
-from warp_reflect.layers import MirrorPixels, ReflectionLayer
+from warp_reflect.layers import ReflectionLayer
 from warp_reflect.scene import SceneView
 from warp_reflect.shade import schlick
 from warp_reflect.surface import shown_normal
@@ -54,9 +54,15 @@ def jitter_kernel(
     out_weight: wp.array(dtype=wp.vec3),
     out_density: wp.array(dtype=float),
 ):
-    """One thread per mirror pixel."""
+    """One thread per mirror pixel; a ray without weight or direction where the number is -1."""
     i = first + wp.tid()
     p = pixel[i]
+    if p < 0:
+        out_normal[i] = wp.vec3(0.0, 0.0, 0.0)
+        out_direction[i] = wp.vec3(0.0, 0.0, 0.0)
+        out_weight[i] = wp.vec3(0.0, 0.0, 0.0)
+        out_density[i] = 0.0
+        return
     view = eye_side(direction[i], normal[i])
     n = shown_normal(normals, p, normal[i])
     lobe = surface_lobe(scene, looks, p, triangle[p], coat)
@@ -112,9 +118,11 @@ def settle_kernel(
     total: wp.array(dtype=wp.vec3),
     out_radiance: wp.array(dtype=wp.vec3),
 ):
-    """One thread per mirror pixel."""
+    """One thread per mirror pixel, but for the number -1."""
     i = first + wp.tid()
     p = pixel[i]
+    if p < 0:
+        return
     n = shown_normal(normals, p, normal[i])
     lobe = surface_lobe(scene, looks, p, triangle[p], coat)
     cosine = wp.dot(eye_side(direction[i], normal[i]), n)
@@ -144,12 +152,12 @@ def followed(scene, shown, layer, row, which: int, count: int) -> Iterator[Rays]
     n = pixels.count
     normal, direction, weight = (wp.empty(n, dtype=wp.vec3, device=device) for _ in range(3))
     density = wp.empty(n, dtype=float, device=device)
-    turned = MirrorPixels(pixels.reflector, pixels.pixel, pixels.point, normal, direction, pixels.box)
+    turned = pixels.turned(direction, normal)
     surface, reflector, width = surface_of(scene, shown, layer), row.reflector, shown.gbuffer.camera.size[0]
     for k in range(count):
         outputs = [normal, direction, weight, density]
         launch.launch(jitter_kernel, n, [*surface, width, k, count, which, *outputs], device, threads)
-        answer = ReflectionLayer.empty(turned, layer.method, device)
+        answer = ReflectionLayer.unset(turned, layer.method, device)
         how = {"threads": threads, "kernels": row.settings.kernels}
         bvh.trace_pixels(scene, shown.gbuffer, turned, answer, reflector.part, reflector.convex, **how)
         yield Rays(weight, density, answer, shown.seen(answer))

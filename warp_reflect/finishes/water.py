@@ -17,7 +17,7 @@ import warp as wp
 
 from warp_reflect import bvh, launch, shade, vector
 from warp_reflect.finishes.still_picture import StillPicture, look_up, make_picture, nearness_at
-from warp_reflect.layers import CameraView, MirrorPixels, ReflectionLayer
+from warp_reflect.layers import CameraView, ReflectionLayer
 from warp_reflect.optics import refract
 from warp_reflect.scene import Scene
 from warp_reflect.shapes import unit
@@ -182,8 +182,11 @@ def turn_kernel(
     direction: wp.array(dtype=wp.vec3),
     out_direction: wp.array(dtype=wp.vec3),
 ):
-    """One thread per mirror pixel."""
+    """One thread per mirror pixel; no direction where the number is -1."""
     i = first + wp.tid()
+    if pixel[i] < 0:
+        out_direction[i] = wp.vec3(0.0, 0.0, 0.0)
+        return
     out_direction[i] = turned_reflection(direction[i], normal[i], shown_normal(normals, pixel[i], normal[i]))
 
 
@@ -229,8 +232,8 @@ def traced(scene: Scene, shown: shade.Shown, layer: ReflectionLayer, row) -> wp.
     direction = wp.empty(pixels.count, dtype=wp.vec3, device=scene.device)
     inputs = [shown.normals, pixels.pixel, pixels.normal, pixels.direction, direction]
     launch.launch(turn_kernel, pixels.count, inputs, scene.device, settings.threads)
-    turned = MirrorPixels(pixels.reflector, pixels.pixel, pixels.point, pixels.normal, direction, pixels.box)
-    answer = ReflectionLayer.empty(turned, layer.method, scene.device)
+    turned = pixels.turned(direction)
+    answer = ReflectionLayer.unset(turned, layer.method, scene.device)
     # A flat mirror never sees itself.
     how = {"threads": settings.threads, "kernels": settings.kernels}
     bvh.trace_pixels(scene, shown.gbuffer, turned, answer, row.reflector.part, True, **how)
