@@ -193,6 +193,34 @@ def test_nothing_is_told_of_a_frame_that_was_drawn_over():
     np.testing.assert_array_equal(second["RGBA"], kept)
 
 
+def test_what_was_asked_of_a_frame_does_not_outlive_it():
+    scene = room(sphere(), placed(0, 0, -1))
+    repeated = wr.capture_frame(scene, planned(scene))
+    first = repeated.render()
+    assert len(first.layers) == 1 and first.statistics["bvh"] > 0
+    repeated.render()
+    with pytest.raises(RuntimeError, match=r"layers: .*drawn over"):
+        first.layers[1]
+
+
+@pytest.mark.parametrize("kernels", ["auto", "plain"])
+def test_frames_take_nothing_over_from_one_that_is_drawn_over(kernels):
+    """With `keep_static` a frame shares the last one's arrays: not those that the next repetition writes to."""
+    scene = room(sphere(), placed(0, 0, -1))
+    plan = planned(scene, kernels=kernels, keep_static=True)
+    moved = dataclasses.replace(plan.camera, eye=plan.camera.eye + 0.3)
+    repeated, alone = wr.capture_frame(scene, plan), wr.render_frame(scene, plan)
+    passing = repeated.render()
+    before = wr.render_frame(scene, plan, previous=passing)
+    repeated.render(moved)
+    after = wr.render_frame(scene, plan, previous=passing)
+    for frame in (before, after):
+        assert not frame.kept
+        for channel in ("RGBA", "reflectorId", "reflectedPoint", "status"):
+            np.testing.assert_array_equal(frame[channel], alone[channel], err_msg=channel)
+    assert wr.render_frame(scene, plan, previous=after).kept  # and of ordinary frames all
+
+
 @pytest.mark.parametrize(
     ("change", "told"),
     [

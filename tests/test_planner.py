@@ -188,6 +188,17 @@ def test_few_points_decide_what_is_clear_and_all_decide_the_rest(device, monkeyp
     assert spacings == [2, 1] and numbers["taken"] == pytest.approx(taken, abs=0.03)  # two deviations of 460 points
 
 
+@pytest.mark.parametrize("size", [(1, 1), (1, 400), (400, 1), (2000, 9)])
+def test_pictures_narrower_than_the_grid_of_points_are_tried_too(size, device):
+    """Two mirrors that may show each other under a light."""
+    scene, asked = lit([LightData("/sun", "distant", (2.0, 2.0, 2.0), placed(0, 0, 0))], device, bounces=2)
+    scene.data.instances.append(dataclasses.replace(scene.data.instances[0], prim_path="/other"))
+    scene = Scene(scene.data, device)
+    plan = wr.make_plan(scene, **asked | {"size": size})
+    assert len(plan.rows) == 2 and all(np.isfinite(row.effects["shadows"].numbers["taken"]) for row in plan.lights)
+    assert np.isfinite(wr.render_frame(scene, plan)["RGBA"]).all()
+
+
 def test_one_setting_changed_on_a_still_scene_draws_the_same_pixels_anew(ball_room):
     first = render(ball_room, "quadric")
     second = render(ball_room, "quadric", previous=first, walk_hops=2)

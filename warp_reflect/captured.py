@@ -91,6 +91,7 @@ class CapturedFrame:
         gbuffer = replace(recorded.gbuffer, camera=view)
         layers = _Told(recorded.layers, view.size[0])
         self._last = Frame(self.scene, plan, gbuffer, layers, recorded._picture, timer.ms, previous)
+        self._last.lasts = False
         return self._last
 
     def _fit_trees(self) -> None:
@@ -162,10 +163,14 @@ class _Told(Mapping):
         self._layers, self._width = layers, width
         self.gone = False  # see `Frame.gone`
 
-    @cached_property
+    @property
     def _found(self) -> dict[int, ReflectionLayer]:
         if self.gone:
             raise RuntimeError("layers: the next captured frame was drawn over this one; ask before that")
+        return self._read
+
+    @cached_property
+    def _read(self) -> dict[int, ReflectionLayer]:
         found = {}
         for id, layer in self._layers.items():
             where, pixels = surface.told(layer.pixels, self._width)

@@ -53,6 +53,7 @@ class Frame:
             `empty`, `bvh`; vertices; ...; the largest bounds: `reused_px`.
         timings: Milliseconds per stage.
         kept: Ids of the reflectors whose layer is the previous frame's own, as nothing had moved.
+        lasts: Whether its arrays stay what they are: those of a `CapturedFrame` are drawn over.
         gone: Whether a `CapturedFrame` has drawn another one over this: nothing can be asked of it any more.
     """
 
@@ -76,7 +77,7 @@ class Frame:
         self._picture = picture
         self.kept = kept
         self.transmitted = transmitted or {}
-        self.gone = False
+        self.lasts, self.gone = True, False
 
     @cached_property
     def timings(self) -> dict[str, float]:
@@ -271,24 +272,26 @@ def render_frame(scene: Scene, plan: Plan, camera: str | Camera | None = None, p
         plan: From `make_plan`; keeps what its techniques prepare.
         camera: Another camera than the plan's; None: the plan's.
         previous: The last frame; searches start from its reflection points, and motion is measured from it. Where neither
-            the eye nor the world has moved since, its answers are taken over (setting `keep_static`).
+            the eye nor the world has moved since, its answers are taken over (setting `keep_static`); of one that was
+            captured, which is drawn over, none are.
 
     Returns:
         A `Frame`.
     """
     timer = StageTimer(scene.device)
     plan = plan.at(scene, None if previous is None else previous.plan)
-    if previous is not None and not previous.kept and plan.settings.budget_ms > 0.0:
-        plan = keep_pace(plan, previous.plan, previous.spent)
+    last = previous if previous is not None and previous.lasts else None  # whose answers may be taken over
+    if last is not None and not last.kept and plan.settings.budget_ms > 0.0:
+        plan = keep_pace(plan, last.plan, last.spent)
     settings = plan.settings
     view = plan.camera if camera is None else find_camera(scene, camera, plan.size)
-    if previous is None:
+    if last is None:
         kernels.begin(kernels.of_plan(plan), scene.device)
-    gbuffer, layers = reflect_scene(scene, plan, view, timer, previous)
-    kept = _kept(layers, previous)
-    same_layers = previous and gbuffer is previous.gbuffer and len(kept) == len(layers)
-    if same_layers and _same_finish(previous, scene, plan):
-        picture, transmitted = previous._picture, previous.transmitted
+    gbuffer, layers = reflect_scene(scene, plan, view, timer, last)
+    kept = _kept(layers, last)
+    same_layers = last and gbuffer is last.gbuffer and len(kept) == len(layers)
+    if same_layers and _same_finish(last, scene, plan):
+        picture, transmitted = last._picture, last.transmitted
     else:
         interfaces = _interfaces(scene, plan)
         with timer("shade"):

@@ -99,7 +99,8 @@ def probe(scene: Scene, seen: EyeView, threads: int = 0, spacing: int = 1, lit: 
     gbuffer = seen.gbuffer
     width, height = gbuffer.camera.size
     stride = spacing * (max(width, height) // TRIED_SIDE) | 1  # odd, so that it falls in step with few patterns
-    rows, columns = (np.arange(stride // 2, side, stride) for side in (height, width))
+    # In the middle where a side has room for one point alone.
+    rows, columns = (np.arange(min(stride, side) // 2, side, stride) for side in (height, width))
     chosen = (rows[:, None] * width + columns).ravel().astype(np.int32)
     there = gbuffer.triangle.numpy()[chosen] >= 0
     count = width * height * float(there.mean())
