@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from contextlib import nullcontext
 from itertools import accumulate
 
 import numpy as np
@@ -249,6 +250,7 @@ class Tracer:
         self._tree: Tree | None = None
         # What moves is in a tree that tracers of all times share.
         self._shared = part is None and bool(scene.moving_parts) and not scene.device.is_cuda
+        self._turn = scene.turn if self._shared else nullcontext()
         triangles = scene.host_triangles
         if part is not None:
             own = scene.parts[part]
@@ -317,8 +319,9 @@ class Tracer:
         triangle = wp.full(n, -1, dtype=int, device=device)
         t, u, v = (wp.zeros(n, dtype=float, device=device) for _ in range(3))
         if self._tree is not None:
-            inputs = [wp.uint64(self.id), self._view, origins, directions, without or OwnBody(), triangle, t, u, v]
-            launch.launch(trace_kernel, n, inputs, device, threads)
+            with self._turn:
+                inputs = [wp.uint64(self.id), self._view, origins, directions, without or OwnBody(), triangle, t, u, v]
+                launch.launch(trace_kernel, n, inputs, device, threads)
         return triangle, t, u, v
 
 

@@ -52,7 +52,7 @@ class CapturedFrame:
         self._place = plan.camera.view(scene)
         seat = Seat(**{each.name: getattr(plan.camera, each.name) for each in fields(Camera)}, taken=self._place)
         plan.take_view(plan.camera)  # what was drawn to plan was read
-        with launch.unread():
+        with launch.unread(), scene.alone():
             # Once before: what is compiled, prepared and kept is so before the launches are written down.
             render_frame(scene, plan, seat)
             with wp.ScopedCapture(scene.device, force_module_load=False) as capture:
@@ -83,7 +83,7 @@ class CapturedFrame:
         if self._last is not None:
             self._last.gone = self._last.layers.gone = True
         timer = StageTimer(self.scene.device)
-        with timer("replay"):
+        with timer("replay"), self.scene.alone():
             self._fit_trees()
             wp.copy(self._place, view.view(self.scene))
             wp.capture_launch(self._graph)
@@ -105,6 +105,8 @@ class CapturedFrame:
 
 def capture_frame(scene: Scene, plan: Plan) -> CapturedFrame:
     """Write down what a plan's frames launch, to repeat it for other cameras.
+
+    Meanwhile no other thread may use the device: what it launches would be written down as well.
 
     Args:
         scene: The plan's own, as it is at its time.

@@ -278,6 +278,11 @@ def render_frame(scene: Scene, plan: Plan, camera: str | Camera | None = None, p
     Returns:
         A `Frame`.
     """
+    with scene.alone():
+        return _drawn(scene, plan, camera, previous)
+
+
+def _drawn(scene: Scene, plan: Plan, camera: str | Camera | None, previous: Frame | None) -> Frame:
     timer = StageTimer(scene.device)
     plan = plan.at(scene, None if previous is None else previous.plan)
     last = previous if previous is not None and previous.lasts else None  # whose answers may be taken over

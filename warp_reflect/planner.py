@@ -398,7 +398,8 @@ def make_plan(
             for number, (k, weight) in enumerate(found, 1)
         ]
         kernels.begin(kernels.of_plan(Plan(*ask, guess, [], [], [], costs)), scene.device)
-    tried, lights = _tried(scene, seen, pixels, [k for k, _ in found], settings, costs)
+    with scene.alone():
+        tried, lights = _tried(scene, seen, pixels, [k for k, _ in found], settings, costs)
     # What techniques draw themselves is shadowed where the picture is.
     cast = shadows_of(lights, settings)
     drawn = settings.replace(shadows=cast is not None and cast.direct)

@@ -8,7 +8,9 @@ Matrices act on columns: `p_world = world_from_object @ [p, 1]`.
 from __future__ import annotations
 
 import copy
+import threading
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -340,6 +342,8 @@ class Scene:
         self.device = wp.get_device(device)
         self.notes = list(data.notes)
         self._reload = reload
+        # Whose turn it is to draw one of the times of a stage, which fit the same trees (`alone`).
+        self.turn = threading.RLock() if earlier is None else earlier.turn
         self.bodies: dict[int, Body] = {}
         # (*key of `AtRest`, what) -> what was found out about the shape of what moves, and which one that was.
         self.facts_at_rest: dict = {}
@@ -421,6 +425,10 @@ class Scene:
         other.notes = [*data.notes, *self.notes[len(self.source_data.notes) :]]
         other.source_data = data
         return other
+
+    def alone(self) -> AbstractContextManager:
+        """In the context no other thread draws or plans a time of the stage, where these fit the same trees to theirs."""
+        return self.turn if self.moving_parts and not self.device.is_cuda else nullcontext()
 
     def shares_world(self, other: Scene) -> bool:
         """Whether two scenes are the same arrays, seen at two times."""

@@ -263,31 +263,33 @@ def _each(matrices: np.ndarray, number: np.ndarray) -> np.ndarray:
 
 def _take_over(scene: Scene, earlier: Scene, moved: _Moved, placed: np.ndarray) -> None:
     """Findings that hold on: of the whole layout, and of the parts that did not move; `placed`: points of those that did."""
-    known, gone = vars(earlier), set(moved.parts)
+    # Copied: another thread may draw that time, and find more of it out, meanwhile.
+    known = {name: dict(found) if isinstance(found, dict) else found for name, found in dict(vars(earlier)).items()}
+    gone = set(moved.parts)
     gone_triangles = {scene.parts[k].first_triangle for k in moved.parts}
     bent = bent_meshes(earlier.data, scene.data)
     for name in PLACELESS:
         if name in known and not (bent and name in OF_SHAPE):
             vars(scene)[name] = known[name]
-    scene.bodies = {k: body for k, body in earlier.bodies.items() if k not in gone}
-    scene.facts_at_rest = {key: fact for key, fact in earlier.facts_at_rest.items() if key[0] not in bent}
+    scene.bodies = {k: body for k, body in known["bodies"].items() if k not in gone}
+    scene.facts_at_rest = {key: fact for key, fact in known["facts_at_rest"].items() if key[0] not in bent}
     scene.pyramids, scene.lasting = earlier.pyramids, earlier.lasting
-    scene.seen = dict(earlier.seen)
-    scene.fits = {k: fit for k, fit in earlier.fits.items() if k not in gone}
-    scene.segmentations = {k: found for k, found in earlier.segmentations.items() if k not in gone}
+    scene.seen = known["seen"]
+    scene.fits = {k: fit for k, fit in known["fits"].items() if k not in gone}
+    scene.segmentations = {k: found for k, found in known["segmentations"].items() if k not in gone}
     scene.facts = {
-        key: fact for key, fact in earlier.facts.items() if key[1] is not None and key[1] not in gone_triangles
+        key: fact for key, fact in known["facts"].items() if key[1] is not None and key[1] not in gone_triangles
     }
     for name in TRACERS:
         if name in known and not bent and (tracer := known[name].at(scene)) is not None:
             # One object where it is one.
             vars(scene)[name] = scene.tracer if known[name] is known.get("tracer") and name != "tracer" else tracer
-    scene.part_tracers = {k: tracer for k, tracer in earlier.part_tracers.items() if k not in gone}
+    scene.part_tracers = {k: tracer for k, tracer in known["part_tracers"].items() if k not in gone}
     corners, triangles = moved.corners
     scene.mirror_tracers = {
         material: tracer
-        for material, tracer in earlier.mirror_tracers.items()
-        if not triangles.any(earlier.seen[material])
+        for material, tracer in known["mirror_tracers"].items()
+        if not triangles.any(known["seen"][material])
     }
     if "lights" in known and same_lights(earlier, scene):
         scene.lights = known["lights"]

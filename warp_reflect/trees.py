@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -34,17 +35,19 @@ class Tree:
         )
         of_triangle = None if groups is None else wp.array(groups, dtype=wp.int32, device=points.device)
         self.mesh = wp.Mesh(points, indices, groups=of_triangle, **kind)
+        self._making = threading.Lock()  # of what several threads that draw one scene ask for at once
         self._wide: WideTree | None = None
         self._fitted: wp.array | None = points
         self._wide_fits = False
 
     def to(self, points: wp.array) -> Tree:
         """Fit it to points, if it is not."""
-        if self._fitted is not points:
-            if self.mesh.points is not points:
-                wp.copy(self.mesh.points, points)
-            self.mesh.refit()
-            self._fitted, self._wide_fits = points, False
+        with self._making:
+            if self._fitted is not points:
+                if self.mesh.points is not points:
+                    wp.copy(self.mesh.points, points)
+                self.mesh.refit()
+                self._fitted, self._wide_fits = points, False
         return self
 
     def loosen(self) -> None:
@@ -63,13 +66,14 @@ class Tree:
     @property
     def wide(self) -> WideTree:
         """The structure that packets walk down; as `packets`."""
-        if self._wide is None:
-            from warp_reflect.wide_tree import WideTree  # not compiled where there are no packets
+        with self._making:
+            if self._wide is None:
+                from warp_reflect.wide_tree import WideTree  # not compiled where there are no packets
 
-            self._wide = WideTree(self.mesh)
-        elif not self._wide_fits:
-            self._wide.fit()
-        self._wide_fits = True
+                self._wide = WideTree(self.mesh)
+            elif not self._wide_fits:
+                self._wide.fit()
+            self._wide_fits = True
         return self._wide
 
 

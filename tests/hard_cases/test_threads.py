@@ -1,14 +1,18 @@
-"""Whole frames with every effect on are the same bits by one thread, by two and by eight."""
+"""Whole frames are the same bits by one thread, by two and by eight; and a program's own threads may draw at once."""
 
 from __future__ import annotations
 
 import dataclasses
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import pytest
 from rooms import placed, plane_room, room, sphere, square
 
 import warp_reflect as wr
+from warp_reflect import wide_tree
 from warp_reflect.channels import CHANNELS
 from warp_reflect.launch import SPLIT_MIN
 from warp_reflect.scene import FinishData, InstanceData, LightData, MaterialData, Scene
@@ -75,3 +79,53 @@ def test_frames_are_the_same_bits_by_any_number_of_threads(rooms, method, thread
         assert np.isfinite(one[name]).all()
         np.testing.assert_array_equal(one[name], two[name], err_msg=name)
     assert (one["reflectedId"] > 0).any() or method == "environment"
+
+
+def by_threads(count: int, job) -> list:
+    """What a job gives for each number, all at once."""
+    with ThreadPoolExecutor(count) as pool:
+        return list(pool.map(job, range(count)))
+
+
+def test_threads_that_ask_a_new_scene_at_once_are_given_one_tree(monkeypatch):
+    """Of two that are made the first would be freed where its number is already on its way to a kernel."""
+    lay_out = wide_tree.WideTree.__init__
+
+    def slowly(self, *given):
+        time.sleep(0.05)
+        lay_out(self, *given)
+
+    monkeypatch.setattr(wide_tree.WideTree, "__init__", slowly)
+    tracer = room(sphere(), placed(0, 0, -1)).tracer
+    assert len(set(by_threads(4, lambda k: tracer.packets))) == 1
+
+
+def test_threads_may_draw_a_new_scene_at_once():
+    def drawn(scene, k):
+        plan = wr.make_plan(scene, size=SIZE, settings=wr.Settings(bounces=1 + k % 2, shadows="on"), method="reference")
+        return wr.render_frame(scene, plan)["RGBA"]
+
+    def anew():
+        return everything(room(sphere(), placed(0, 0, -1, 1.5)))
+
+    known, scene = [drawn(anew(), k) for k in range(2)], anew()
+    for k, picture in enumerate(by_threads(4, lambda k: drawn(scene, k))):
+        np.testing.assert_array_equal(picture, known[k % 2])
+
+
+def test_threads_may_draw_times_of_a_stage_at_once():
+    """They fit one tree to what has moved, each to its own."""
+    stage = Path(__file__).parents[2] / "usd_scenes" / "city_block.usda"
+    asked = {"size": (96, 54), "settings": wr.Settings(shadows="on"), "method": "reference"}
+    first = wr.load_stage(stage, time=1.0)
+    wr.render_frame(first, wr.make_plan(first, **asked))
+    times = [first.at(code) for code in (10.0, 20.0, 30.0, 40.0)]
+    assert first.tracer._tree is times[0].tracer._tree is times[3].tracer._tree
+    plans = [wr.make_plan(scene, **asked) for scene in times]
+    known = [wr.render_frame(scene, plan)["RGBA"] for scene, plan in zip(times, plans, strict=True)]
+    for _ in range(3):
+        for k, picture in enumerate(by_threads(4, lambda k: wr.render_frame(times[k], plans[k])["RGBA"])):
+            np.testing.assert_array_equal(picture, known[k])
+    plan = wr.make_plan(first, **asked)
+    for k, picture in enumerate(by_threads(4, lambda k: wr.render_frame(first.at(10.0 * (k + 1)), plan)["RGBA"])):
+        np.testing.assert_array_equal(picture, known[k])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import threading
 from pathlib import Path
 
 from warp_reflect.scene import Note, Scene, SceneData
@@ -46,10 +47,14 @@ def load_stage(
     from warp_reflect.stage.read import StageReader
 
     arguments = path, purposes, complexity, strict, Limits(root=str(root)), reflectors
-    reader = None if untrusted else StageReader(*arguments)
+    reader, reading = None if untrusted else StageReader(*arguments), threading.Lock()
 
     def at(code: float | None, known: Scene | None = None) -> Scene:
-        data = _without_map_files(read_untrusted(path, code, *arguments[1:])) if reader is None else reader.read(code)
+        if reader is None:
+            data = _without_map_files(read_untrusted(path, code, *arguments[1:]))
+        else:
+            with reading:
+                data = reader.read(code)
         seen = known.seen_at(data) if known is not None else None
         return Scene(data, device, reload=at, earlier=known) if seen is None else seen
 
