@@ -173,6 +173,26 @@ def test_near_plane_clipping_matches_ray_oracle(seed):
     assert len(drawn ^ clipped_oracle(points)) <= 2
 
 
+@pytest.mark.parametrize("kernels", ["plain", "auto"])
+def test_what_lies_beyond_a_side_of_the_picture_is_not_clipped(kernels):
+    """Of triangles with a corner behind the eye those survive that no side of the frustum, seen by all corners, hides."""
+    rng = np.random.default_rng(8)
+    points = rng.uniform(-3, 3, (600, 3, 3))
+    points[:, 0, 2], points[:, 1, 2] = -rng.uniform(0.1, 3, 600), rng.uniform(0.5, 3, 600)
+    screen = wp.array(
+        np.array([homogeneous(each) for each in points], np.float32).reshape(-1, 4), dtype=wp.vec4, device="cpu"
+    )
+    w = points[..., 2]
+    x, y = (20 * points[..., k] + 16 * w for k in (0, 1))
+    hidden = [side.all(axis=1) for side in (x < 0, y < 0, x > 32 * w, y > 32 * w)]
+    expected = int((~np.any(hidden, axis=0)).sum())
+    assert 100 < expected < 500
+    target = raster.make_target(raster.Picture((32, 32), NEAR, 100.0), (0, 0, 32, 32), "cpu")
+    index = wp.array(np.arange(1800, dtype=np.int32).reshape(-1, 3), dtype=wp.vec3i, device="cpu")
+    survivors = raster.rasterise(target, screen, index, threads=1, kernels=kernels)
+    assert int(survivors.numpy().sum()) == expected
+
+
 def test_huge_triangles_are_clipped_to_the_guard_band():
     big = 1.0e9
     ids, _ = draw(flat([[[-big, -big], [big, -big], [0, big]]]), 32, 32)

@@ -374,6 +374,23 @@ def covers_centre(target: TargetView, a: wp.vec4, b: wp.vec4, c: wp.vec4) -> boo
     return box[0] <= box[2] and box[1] <= box[3]
 
 
+@wp.func
+def beyond(target: TargetView, v: wp.vec4) -> int:
+    """Bits of the sides of a target's frustum that a projected vertex lies beyond: left, right, top, bottom, near."""
+    w = wp.where(v[2] > 0.0 or target.orthographic != 0, 1.0, v[3])  # else (x, y) are homogeneous, see `layers.project`
+    sides = wp.where(v[0] < float(target.x0) * w, 1, 0)
+    sides += wp.where(v[0] > float(target.x1) * w, 2, 0)
+    sides += wp.where(v[1] < float(target.y0) * w, 4, 0)
+    sides += wp.where(v[1] > float(target.y1) * w, 8, 0)
+    return sides + wp.where(v[3] < target.near, 16, 0)
+
+
+@wp.func
+def beside(target: TargetView, a: wp.vec4, b: wp.vec4, c: wp.vec4) -> bool:
+    """Whether a triangle that would have to be clipped lies beyond one side of the frustum: it is cheap to tell."""
+    return (beyond(target, a) & beyond(target, b) & beyond(target, c)) != 0
+
+
 @wp.kernel(module=PLAIN)
 def cull_kernel(
     first: int,
@@ -398,7 +415,7 @@ def cull_kernel(
     if not (a[2] >= 0.0 and b[2] >= 0.0 and c[2] >= 0.0):
         return
     if needs_clipping(a) or needs_clipping(b) or needs_clipping(c):
-        if a[3] < target.near and b[3] < target.near and c[3] < target.near:
+        if beside(target, a, b, c):
             return
     elif not covers_centre(target, a, b, c):
         return

@@ -156,9 +156,7 @@ _TARGET = (
         survivors += __builtin_popcount(marks(surviving) & valid);
         for (unsigned left_over = cut; left_over != 0; left_over &= left_over - 1) {
             const int l = __builtin_ctz(left_over);
-            bool before = true;
-            for (int each = 0; each < 3; ++each) before &= screen_of[4 * corners[3 * l + each] + 3] < target.near;
-            if (before) cut &= ~(1u << l);
+            if (beside(corners + 3 * l, screen_of, target)) cut &= ~(1u << l);
         }
         survivors += __builtin_popcount(cut);
         others |= (unsigned long long)(cut | (seen & ~small)) << (start - begin);

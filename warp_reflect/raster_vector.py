@@ -137,9 +137,7 @@ _TARGET = (
         unsigned cut = marks(c.clipped) & valid;
         for (unsigned left = cut; left != 0; left &= left - 1) {
             const int l = __builtin_ctz(left);
-            bool before = true;
-            for (int each = 0; each < 3; ++each) before &= screen_of[4 * corners[3 * l + each] + 3] < target.near;
-            if (before) cut &= ~(1u << l);
+            if (beside(corners + 3 * l, screen_of, target)) cut &= ~(1u << l);
         }
         const unsigned kept = cut | marks(c.sound & (c.left <= c.right) & (c.top <= c.bottom)) & valid;
         const F key = fmax(c.v[0].z, fmax(c.v[1].z, c.v[2].z)), farthest = fmin(c.v[0].z, fmin(c.v[1].z, c.v[2].z));

@@ -463,9 +463,20 @@ TRIANGLES = (
         c.small = (high_x - low_x <= 64 * 256) & (high_y - low_y <= 64 * 256);
         return c;
     };
+    // raster.beside
+    auto beside = [](const int* corners, const float* screen, const auto& target) -> bool {
+        int beyond = 31;
+        for (int each = 0; each < 3; ++each) {
+            const float* v = screen + 4 * corners[each];
+            const float w = v[2] > 0.0f || target.orthographic != 0 ? 1.0f : v[3];
+            beyond &= (v[0] < target.x0 * w) | (v[0] > target.x1 * w) << 1 | (v[1] < target.y0 * w) << 2
+                | (v[1] > target.y1 * w) << 3 | (v[3] < target.near) << 4;
+        }
+        return beyond != 0;
+    };
     // raster.edge_bias
     auto edge_bias = [](I dx, I dy) -> I { return ((dy < 0) | ((dy == 0) & (dx > 0))) ? I(0) : I(-1); };
-    (void)marks; (void)marked; (void)cornered; (void)edge_bias;
+    (void)marks; (void)marked; (void)cornered; (void)beside; (void)edge_bias;
 """
 )
 
