@@ -222,12 +222,38 @@ _HEAD = r"""
         return __builtin_bit_cast(I, spread_out(joined(part), which));
     };
     // Eight floats.
+#if defined(__AVX512F__)
+    auto gather8 = [four_columns](const float* p, I start, F* out) {
+        // Half a vector an element, and half of the loads that four floats at a time take: of each block of 128 bits that comes
+        // out, the first and the third are of the first four floats.
+        int at[LANES];
+        __builtin_memcpy(at, &start, sizeof(at));
+        F columns[2][4];
+        _Pragma("clang loop unroll(full)") for (int half = 0; half < 2; ++half) {
+            F r[4];
+            _Pragma("clang loop unroll(full)") for (int k = 0; k < 4; ++k) {
+                Row a, b;
+                __builtin_memcpy(&a, p + at[8 * half + k], sizeof(a));
+                __builtin_memcpy(&b, p + at[8 * half + 4 + k], sizeof(b));
+                r[k] = __builtin_shufflevector(a, b, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+            }
+            four_columns(r, columns[half]);
+        }
+        _Pragma("clang loop unroll(full)") for (int k = 0; k < 4; ++k) {
+            out[k] = __builtin_shufflevector(
+                columns[0][k], columns[1][k], 0, 1, 2, 3, 8, 9, 10, 11, 16, 17, 18, 19, 24, 25, 26, 27);
+            out[k + 4] = __builtin_shufflevector(
+                columns[0][k], columns[1][k], 4, 5, 6, 7, 12, 13, 14, 15, 20, 21, 22, 23, 28, 29, 30, 31);
+        }
+    };
+#else
     auto gather8 = [fours](const float* p, I start, F* out) {
         int at[LANES];
         __builtin_memcpy(at, &start, sizeof(at));
         fours(p, at, out);
         fours(p + 4, at, out + 4);
     };
+#endif
     // Eight rows of eight floats each, at p[start[k]], as columns.
     auto transposed = [](const float* p, const int* start, Row* out) {
         _Pragma("clang loop unroll(full)") for (int half = 0; half < 8; half += 4) {
