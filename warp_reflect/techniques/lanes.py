@@ -118,23 +118,23 @@ VIRTUAL_VERTEX = (
     };
     auto put_each = [&](I done, I vertex, const Answer& a) {
         // By memory: the compiler would store a whole vector for every lane that is taken out of it.
-        const F each[9] = {a.x, a.y, a.key, a.depth, a.reach, a.residual, a.seed.x, a.seed.y, a.seed.z};
-        float lane[9][LANES], place[3][LANES];
+        float reach[LANES], residual[LANES], row[4 * LANES], seed[3 * LANES], place[3 * LANES];
         int to[LANES], as[LANES];
-        for (int k = 0; k < 9; ++k) store(lane[k], each[k]);
-        store(place[0], a.place.x); store(place[1], a.place.y); store(place[2], a.place.z);
+        store(reach, a.reach);
+        store(residual, a.residual);
+        vstore4(row, 0, V{a.x, a.y, a.key}, a.depth);
+        vstore(seed, 0, a.seed);
+        if (placed) vstore(place, 0, a.place);
         istore(to, vertex);
         istore(as, a.status);
         for (unsigned left = bits(done); left != 0; left &= left - 1) {
             const int l = __builtin_ctz(left), i = to[l];
             status[i] = (unsigned char)as[l];
-            out_vertex.reach.data[i] = lane[4][l];
-            out_vertex.residual.data[i] = lane[5][l];
-            for (int k = 0; k < 4; ++k) screen[4 * i + k] = lane[k][l];
-            for (int k = 0; k < 3; ++k) seeds[3 * i + k] = lane[6 + k][l];
-            if (placed) {
-                for (int k = 0; k < 3; ++k) positions[3 * i + k] = place[k][l];
-            }
+            out_vertex.reach.data[i] = reach[l];
+            out_vertex.residual.data[i] = residual[l];
+            __builtin_memcpy(screen + 4 * i, row + 4 * l, 4 * sizeof(float));
+            __builtin_memcpy(seeds + 3 * i, seed + 3 * l, 3 * sizeof(float));
+            if (placed) __builtin_memcpy(positions + 3 * i, place + 3 * l, 3 * sizeof(float));
         }
     };
     auto settle = [&](I done, I answer, I vertex, V seed, F residual, V image, F reach) {
@@ -250,7 +250,7 @@ IS_VISIBLE = r"""
 
 # After those samples, of `map_search`: `measure`, `newton_step`, `step_on_cube`.
 MAP_STEPS = r"""
-    struct Law { F inv_o, inv_v, residual, cos_eye, cos_target; };
+    struct Law { F inv_o, inv_v, inv_w, residual, cos_eye, cos_target; };
     // reflector_maps.slide
     auto slide = [&](const Sample& s, F along_u, F along_v) -> Sample {
         Sample moved;
@@ -269,7 +269,8 @@ MAP_STEPS = r"""
         law.cos_target = dot(s.n, v);
         const F w_n = law.cos_eye + law.cos_target;
         const V w_t = sub(add(o, v), times(w_n, s.n));
-        law.residual = pick(w_n > normal_part_min, length(w_t) * (1.0f / w_n), 1.0e4f - w_n);
+        law.inv_w = 1.0f / w_n;
+        law.residual = pick(w_n > normal_part_min, length(w_t) * law.inv_w, 1.0e4f - w_n);
         return law;
     };
     // Directions are calculated again: what a vector keeps of an evaluation takes as long to write as to find.
@@ -295,7 +296,7 @@ MAP_STEPS = r"""
         const F h12 = f * both - o1 * i_o2 - v1 * i_v2 + k * s12;
         const F g1 = o1 + v1, g2 = o2 + v2;
         const F det_h = h11 * h22 - h12 * h12;
-        const F inv_w = 1.0f / w_n;
+        const F inv_w = law.inv_w;
         const F q1 = (dot(s.n_u, w_t) + n_o * i_o1 + n_v * i_v1) * inv_w;
         const F q2 = (dot(s.n_v, w_t) + n_o * i_o2 + n_v * i_v2) * inv_w;
         const F j11 = h11 + g1 * q1, j12 = h12 + g1 * q2, j21 = h12 + g2 * q1, j22 = h22 + g2 * q2;

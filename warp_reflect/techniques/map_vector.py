@@ -64,19 +64,21 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
 #define KEEP_APART(row) asm volatile("" : : "r"(&row) : "memory");
     struct Search {
         const float* row;
-        V x, best, p, n, step;
-        F residual, shrink;
-        I asked, going, better, near, later, used;
-        Cell cells[2];  // of this evaluation and of the next, in turn
-        Sample s;
-        Law law;
+        V step;
+        F shrink;
+        I asked, going, better, later, used;
+        // Of this evaluation and of the next, in turn. Of this one only the cell is where it was: the rest is of the best.
+        V x[2];
+        Sample s[2];
+        Cell cells[2];
+        Law law;  // with the best's residual
+        int last, turns;
     };
     Search group[ROWS];
     Search unasked;  // what is known before the first evaluation
-    unasked.residual = F(1.0e30f);
+    unasked.law.residual = F(1.0e30f);
     unasked.shrink = F(1.0f);
-    unasked.used = I(0);
-    unasked.best = unasked.p = unasked.n = unasked.step = same(0.0f);
+    unasked.x[1] = unasked.s[1].p = unasked.s[1].n = unasked.step = same(0.0f);
     // map_search.search_newton. A vector goes on while more than FEW of its lanes do: the others go on side by side after the
     // last run, and then those that ended far from a root start again from a coarse seed.
     for (int round = 0; round < RUNS + 2; ++round) {
@@ -101,7 +103,16 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
                 const V point = vrows((const float*)points.data, start, full, own);
                 const V target = add(matrix(frame.unit_from_scene, point), spread(frame.unit_offset));
                 const I visible = is_visible(asked, target);
-                for (unsigned left = bits(asked & ~visible); left != 0; left &= left - 1) {
+                V seed = same(0.0f);
+                if (warm != 0) seed = vrows(seeds, start, full, own);
+                const unsigned unseen = bits(asked & ~visible);
+                if (unseen && bits(asked) == bits(I(-1))) {
+                    // All of them: those in sight are answered later.
+                    const Bytes byte = Bytes((unsigned char)hidden);
+                    __builtin_memcpy(status + start, &byte, sizeof(byte));
+                    vstore(seeds, start, same(0.0f));
+                    vstore4(screen, start, V{F(0.0f), F(0.0f), F(-1.0f)}, F(0.0f));
+                } else for (unsigned left = unseen; left != 0; left &= left - 1) {
                     const int i = start + __builtin_ctz(left);
                     status[i] = (unsigned char)hidden;
                     seeds[3 * i] = seeds[3 * i + 1] = seeds[3 * i + 2] = 0.0f;
@@ -110,8 +121,6 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
                 }
                 asked &= visible;
                 if (!bits(asked)) continue;
-                V seed = same(0.0f);
-                if (warm != 0) seed = vrows(seeds, start, full, own);
                 const I unknown = size(seed) == 0.0f;
                 seed = project_to_cube(seed);
                 if (bits(asked & unknown)) {
@@ -202,85 +211,89 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
                 };
                 g.asked = g.going = start + lanes() < searched;
                 g.row = row;
-                g.x = at_row(X);
-                g.later = I(0);
+                g.x[0] = at_row(X);
+                g.cells[0] = map_cell(g.x[0]);
+                g.later = g.used = I(0);
                 if (in_few) {
-                    g.best = at_row(BEST);
-                    g.p = at_row(P);
-                    g.n = at_row(N);
+                    g.x[1] = at_row(BEST);
+                    g.s[1].p = at_row(P);
+                    g.s[1].n = at_row(N);
                     g.step = at_row(STEP);
-                    g.residual = load(row + RESIDUAL * ROW);
+                    g.law.residual = load(row + RESIDUAL * ROW);
                     g.shrink = load(row + SHRINK * ROW);
                     g.used = iload(few_used + start);
                 }
-                g.cells[0] = map_cell(g.x);
                 open[k] = k;
             }
             auto target_of = [&](const Search& g) -> V { return V{load(g.row), load(g.row + ROW), load(g.row + 2 * ROW)}; };
-            for (int turn = 0; opened > 0; turn ^= 1) {
+            for (int turns = 1; opened > 0; ++turns) {
+                const int now = (turns - 1) & 1, next = turns & 1;
                 // Of all vectors the samples, then how good they are, then the steps, then, of those near a root, their ends.
                 int on = 0, near_root[ROWS], near_count = 0;
-                for (int k = 0; k < opened; ++k) group[open[k]].s = sample_cell(group[open[k]].cells[turn]);
+                for (int k = 0; k < opened; ++k) group[open[k]].s[now] = sample_cell(group[open[k]].cells[now]);
                 for (int k = 0; k < opened; ++k) {
                     Search& g = group[open[k]];
                     const Search& known = begun ? g : unasked;
-                    g.law = measure(g.s, target_of(g));
-                    const F here = g.law.residual;
-                    const I better = g.going & (here < known.residual);
-                    const V best = vpick(better, g.x, known.best);
-                    const V p = vpick(better, g.s.p, known.p), n = vpick(better, g.s.n, known.n);
-                    const F residual = pick(better, here, known.residual);
+                    Law law = measure(g.s[now], target_of(g));
+                    const I better = g.going & (law.residual < known.law.residual);
+                    const F residual = pick(better, law.residual, known.law.residual);
                     const F shrink = pick(better, F(1.0f), known.shrink * retry_shrink);
-                    const I used = known.used + 1;
                     const F least = pick(residual <= accepted, F(shrink_near), F(shrink_min));
                     const I unended = ~(residual <= settings.tolerance) & (shrink >= least);
-                    const I going = g.going & unended & (used < settings.iterations);
-                    const I near = going & better & (residual * residual <= settings.tolerance);
+                    const I going = g.going & unended & (g.used + turns < settings.iterations);
+                    if (bits(better) != bits(I(-1))) {
+                        const V x = vpick(better, g.x[now], known.x[next]);
+                        const V p = vpick(better, g.s[now].p, known.s[next].p), n = vpick(better, g.s[now].n, known.s[next].n);
+                        KEEP_APART(g)
+                        g.x[now] = x;
+                        g.s[now].p = p;
+                        g.s[now].n = n;
+                    }
+                    law.residual = residual;
                     KEEP_APART(g)
-                    g.best = best;
-                    g.p = p;
-                    g.n = n;
-                    g.residual = residual;
+                    g.law = law;
                     g.shrink = shrink;
-                    g.used = used;
                     g.better = better;
                     g.going = going;
-                    g.near = near;
+                    g.last = now;
+                    g.turns = turns;
                     near_root[near_count] = open[k];
-                    near_count += bits(near) != 0;
+                    near_count += bits(going & better & (residual * residual <= settings.tolerance)) != 0;
                     open[on] = open[k];
                     on += bits(going) != 0;
                 }
                 opened = on;
                 for (int k = 0; k < opened; ++k) {
                     Search& g = group[open[k]];
-                    const V step = vpick(g.better, newton_step(g.s, g.law, target_of(g)), (begun ? g : unasked).step);
+                    const V step = vpick(g.better, newton_step(g.s[now], g.law, target_of(g)), (begun ? g : unasked).step);
                     KEEP_APART(g)
                     g.step = step;
                 }
                 for (int k = 0; k < opened; ++k) {
                     Search& g = group[open[k]];
-                    const V x = vpick(g.going, step_on_cube(g.best, g.p, g.step, g.shrink), g.x);
+                    const V x = vpick(g.going, step_on_cube(g.x[now], g.s[now].p, g.step, g.shrink), g.x[now]);
                     KEEP_APART(g)
-                    g.x = x;
-                    g.cells[turn ^ 1] = map_cell(x);
+                    g.x[next] = x;
+                    g.cells[next] = map_cell(x);
                 }
                 begun = true;
                 for (int k = 0; k < near_count; ++k) {
                     Search& g = group[near_root[k]];
-                    const Cell from = g.cells[turn], to = g.cells[turn ^ 1];
+                    const Cell from = g.cells[now], to = g.cells[next];
                     const F along_u = to.a - from.a, along_v = to.b - from.b;
-                    const Sample end = slide(g.s, along_u, along_v);
-                    const F there = measure(end, target_of(g)).residual;
-                    const I ended = g.near & (to.texel == from.texel) & (magnitude(along_u * along_v) <= twist_max)
+                    const Sample end = slide(g.s[now], along_u, along_v);
+                    const F there = measure(end, target_of(g)).residual, residual_here = g.law.residual;
+                    const I near = g.going & g.better & (residual_here * residual_here <= settings.tolerance);
+                    const I ended = near & (to.texel == from.texel) & (magnitude(along_u * along_v) <= twist_max)
                         & (there <= settings.tolerance);
-                    const V best = vpick(ended, g.x, g.best), p = vpick(ended, end.p, g.p), n = vpick(ended, end.n, g.n);
-                    const F residual = pick(ended, there, g.residual);
+                    const V x = vpick(ended, g.x[next], g.x[now]);
+                    const V p = vpick(ended, end.p, g.s[now].p), n = vpick(ended, end.n, g.s[now].n);
+                    const F residual = pick(ended, there, residual_here);
                     KEEP_APART(g)
-                    g.best = best;
-                    g.p = p;
-                    g.n = n;
-                    g.residual = residual;
+                    g.x[now] = x;
+                    g.s[now].p = p;
+                    g.s[now].n = n;
+                    g.law.residual = residual;
                     g.going &= ~ended;
                 }
                 on = 0;
@@ -296,15 +309,16 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
             for (int k = 0; k < vectors; ++k) {
                 const Search& g = group[k];
                 const int start = from + k * LANES;
-                const V target = target_of(g), best = g.best, p = g.p, n = g.n;
-                const F residual = g.residual;
+                const V target = target_of(g), best = g.x[g.last], p = g.s[g.last].p, n = g.s[g.last].n;
+                const F residual = g.law.residual;
                 const I asked = g.asked, later = g.later, vertex = iload(numbers + start);
                 if (bits(later)) {
-                    const F each[KEPT] = {target.x, target.y, target.z, g.x.x, g.x.y, g.x.z, best.x, best.y, best.z,
+                    const V x = g.x[g.last ^ 1];
+                    const F each[KEPT] = {target.x, target.y, target.z, x.x, x.y, x.z, best.x, best.y, best.z,
                         p.x, p.y, p.z, n.x, n.y, n.z, g.step.x, g.step.y, g.step.z, residual, g.shrink};
                     const unsigned marked = bits(later);
                     for (int k = 0; k < KEPT; ++k) packed((int*)few[k] + few_count, __builtin_bit_cast(I, each[k]), marked);
-                    packed(few_used + few_count, g.used, marked);
+                    packed(few_used + few_count, g.used + g.turns, marked);
                     few_count += packed(few_vertex + few_count, vertex, marked);
                 }
                 I done = asked & ~later & (residual <= accepted), answer = I(converged);
