@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_reflect import launch
+from warp_reflect import launch, timing
 
 wp.set_module_options({"enable_backward": False})
 
@@ -128,6 +128,47 @@ def test_failure_of_any_thread_is_raised_when_all_are_done(failing):
         with pytest.raises(ValueError, match=f"number {failing}"):
             launch.run_parallel([partial(job, k) for k in range(3)])
         assert sorted(done) == [k for k in range(3) if k != failing]
+
+
+class Slow:
+    """A module that takes some seconds of a clock to load."""
+
+    def __init__(self, now: list[float], seconds: float):
+        self._now, self._seconds = now, seconds
+
+    def done(self) -> bool:
+        return False
+
+    def exception(self) -> None:
+        self._now[0] += self._seconds
+
+    def result(self) -> None:
+        """Nothing went wrong."""
+
+
+@pytest.mark.parametrize("seconds", [7.0, 0.0])
+def test_waiting_for_kernels_is_left_out_of_what_a_stage_takes(seconds, monkeypatch):
+    """By a clock of the wall, and by one that stands while its thread waits; what another thread waits for is no part of it."""
+    now = [0.0]
+    monkeypatch.setattr(launch, "_begun", lambda module, device: Slow(now, seconds))
+    with timing.counted_by(lambda: now[0]):
+        timer = timing.StageTimer()
+        with timer("loads"):
+            launch._load(count_up_kernel, "cpu")
+            now[0] += 2.0
+        with timer("beside"):
+            other = threading.Thread(target=launch._load, args=(count_up_kernel, "cpu"))
+            other.start()
+            other.join()
+    assert dict(timer.ms) == {"loads": 2000.0, "beside": 1000.0 * seconds}
+
+
+def test_a_clock_inside_another_is_taken_off_alone():
+    with timing.counted_by(time.thread_time):
+        with timing.counted_by(time.perf_counter):
+            assert launch.clocks[-1] is time.perf_counter
+        assert launch.clocks == [time.perf_counter, time.thread_time]
+    assert launch.clocks == [time.perf_counter]
 
 
 def test_launches_of_many_threads_do_not_get_into_each_others_way():

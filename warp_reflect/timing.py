@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from time import perf_counter
 
 import warp as wp
 
 from warp_reflect.counts import Statistics, add_statistics
-from warp_reflect.launch import loading_ms, reads
-
-_clocks: list[Callable[[], float]] = [perf_counter]
+from warp_reflect.launch import clocks, loading_ms, reads
 
 
 @contextmanager
@@ -23,11 +20,11 @@ def counted_by(clock: Callable[[], float]) -> Iterator[None]:
     Args:
         clock: Gives seconds.
     """
-    _clocks.append(clock)
+    clocks.append(clock)
     try:
         yield
     finally:
-        _clocks.remove(clock)
+        del clocks[len(clocks) - 1 - clocks[::-1].index(clock)]  # other threads may have come since
 
 
 class StageTimer:
@@ -53,7 +50,7 @@ class StageTimer:
         full = name if name.startswith(parent) else parent + name
         add_statistics(self.ms, {full: 0.0})  # in the order they were entered
         self._open.append(full)
-        clock, begin = _clocks[-1], self._mark()
+        clock, begin = clocks[-1], self._mark()
         start, loading = clock(), loading_ms()
         try:
             yield
