@@ -1,5 +1,6 @@
 """A plan at another time is the plan made from nothing there: whatever moved, and whatever was taken over from before."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -156,6 +157,17 @@ def test_what_is_prepared_for_mirrors_that_stand_still_is_kept(method, count, tm
         whole = wr.render_frame(fresh, wr.make_plan(fresh, size=SIZE, settings=settings, method=method))
         for name in ("RGBA", "reflectedPoint", "status"):
             np.testing.assert_array_equal(frame[name], whole[name], err_msg=f"{name} at {time}")
+
+
+def test_a_camera_of_ones_own_stays_where_it_is(tmp_path):
+    scene = wr.load_stage(kitchen(tmp_path, CAMERA), time=1.0)
+    plan = wr.make_plan(scene, size=SIZE)
+    own = wr.make_plan(scene, dataclasses.replace(plan.camera, eye=plan.camera.eye + 0.1), SIZE)
+    there = wr.load_stage(kitchen(tmp_path, CAMERA), time=9.0)
+    first = wr.render_frame(scene.at(5.0), own)
+    later = wr.render_frame(scene.at(9.0), own, previous=first)
+    assert later.camera.sees_as(own.camera) and later.plan.camera.sees_as(own.camera)
+    assert wr.render_frame(scene.at(9.0), plan).camera.sees_as(wr.make_plan(there, size=SIZE).camera)
 
 
 def test_findings_that_are_kept_too_long_are_noticed(tmp_path):

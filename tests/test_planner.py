@@ -42,6 +42,25 @@ def test_mirror_out_of_view_costs_nothing(ball_room):
     assert not [name for name, _ in launches if "trace" in name or "techniques" in name or "mirror_pixels" in name]
 
 
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"eye": np.array([np.nan, 0.0, 0.0])}, r"eye: got \[nan"),
+        ({"forward": np.array([0.0, np.inf, 0.0])}, "forward: got"),
+        ({"fx": np.nan}, "fx: got nan"),
+        ({"fx": 0.0}, "fx: got 0"),
+        ({"near": np.nan}, "near: got nan"),
+    ],
+)
+def test_cameras_that_see_nothing_are_refused(change, told, ball_room):
+    plan = wr.make_plan(ball_room, size=SIZE)
+    camera = dataclasses.replace(plan.camera, **change)
+    with pytest.raises(ValueError, match=f"camera: {told}"):
+        wr.make_plan(ball_room, camera, SIZE)
+    with pytest.raises(ValueError, match=f"camera: {told}"):
+        wr.render_frame(ball_room, plan, camera)
+
+
 def test_tiny_mirror_gets_the_cheapest_without_a_look_at_its_shape(ball_room):
     pixels = planned(ball_room).pixels
     scene = Scene(ball_room.data, str(ball_room.device))

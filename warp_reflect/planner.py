@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
@@ -215,7 +216,7 @@ class Plan:
         return dataclasses.replace(seen, gbuffer=dataclasses.replace(seen.gbuffer, camera=camera))
 
     def at(self, scene: Scene, last: Plan | None = None) -> Plan:
-        """The plan for its stage at another time: decided anew, with its own camera there.
+        """The plan for its stage at another time: decided anew; a camera of the stage is where it is then, another stays.
 
         Args:
             scene: The stage then.
@@ -224,10 +225,15 @@ class Plan:
         if scene is self.scene:
             return self
         same = last is not None and (last.settings, last.method, last.size) == (self.settings, self.method, self.size)
-        moving = any(camera.path == self.camera.path for camera in scene.data.cameras)
-        camera = self.camera.path if moving else self.camera
+        there = any(camera.path == self.camera.path for camera in scene.data.cameras)
+        camera = self.camera.path if there and self._sees_as_staged() else self.camera
         earlier = last if same else self
         return make_plan(scene, camera, self.size, self.settings, self.method, earlier=earlier, costs=self.costs)
+
+    def _sees_as_staged(self) -> bool:
+        """Whether the camera is the stage's own, and not one made from it."""
+        own = (camera for camera in self.scene.data.cameras if camera.path == self.camera.path)
+        return any(Camera.from_data(camera, self.size).sees_as(self.camera) for camera in own)
 
     def to_json(self) -> dict:
         """The plan as `warp-reflect plan --json` prints it."""
@@ -597,11 +603,16 @@ def _holds(made: Plan, earlier: Plan, row: PlanRow) -> bool:
 
 
 def find_camera(scene: Scene, camera: str | Camera | None, size: tuple[int, int]) -> Camera:
-    """The named camera of a scene (path or unique name; None: the first) at an image size."""
+    """The named camera of a scene (path or unique name; None: the first) at an image size.
+
+    Raises:
+        ValueError: an impossible size, no such camera, or a `Camera` that no picture can be drawn by.
+    """
     width, height = (int(side) for side in size)
     if not (1 <= width <= raster.GUARD and 1 <= height <= raster.GUARD):
         raise ValueError(f"size: got {width}x{height}, expected 1 to {int(raster.GUARD)} pixels a side")
     if isinstance(camera, Camera):
+        _check(camera)
         return dataclasses.replace(camera, size=(width, height)) if camera.size != (width, height) else camera
     cameras = scene.data.cameras
     if camera is None:
@@ -614,6 +625,21 @@ def find_camera(scene: Scene, camera: str | Camera | None, size: tuple[int, int]
         known = ", ".join(c.path for c in matching or cameras) or "none"
         raise ValueError(f"camera: '{camera}' names {len(matching)} cameras; the stage has: {known}")
     return Camera.from_data((exact or matching)[0], (width, height))
+
+
+def _check(camera: Camera) -> None:
+    """Refuse what would be seen as NaN, or as nothing."""
+    vectors, numbers = ("eye", "right", "up", "forward"), ("fx", "fy", "cx", "cy")
+    every = *camera.eye, *camera.right, *camera.up, *camera.forward, *(getattr(camera, name) for name in numbers)
+    if not all(map(math.isfinite, every)):
+        name = next(name for name in (*vectors, *numbers) if not np.isfinite(getattr(camera, name)).all())
+        raise ValueError(f"camera: {name}: got {getattr(camera, name)}, expected finite numbers")
+    for name in ("fx", "fy"):
+        if getattr(camera, name) == 0.0:
+            raise ValueError(f"camera: {name}: got 0, expected another number of pixels")
+    for name in ("near", "far"):
+        if np.isnan(getattr(camera, name)):
+            raise ValueError(f"camera: {name}: got nan, expected a depth")
 
 
 def _look(
