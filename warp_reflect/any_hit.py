@@ -37,7 +37,7 @@ ANY_HIT = (
     // The hull of a box around where rays start and one around where they end: between `low` and `high`, and within sides along
     // one axis past a corner of either box. `out_u`, `out_v` lead out of such a one on the other two, past `at`.
     struct Side { int row_u, row_v; float out_u, out_v, at; };
-    struct Shaft { float low[3], high[3]; int count; Side sides[13]; };
+    struct Shaft { float low[3], high[3]; int count, ends[3]; Side sides[13]; };
     auto shaft_of = [&](V starts_low, V starts_high, V ends_low, V ends_high) -> Shaft {
         const float p[2][3] = {
             {folded(starts_low.x, lesser), folded(starts_low.y, lesser), folded(starts_low.z, lesser)},
@@ -72,6 +72,7 @@ ANY_HIT = (
                 by.sides[by.count] = Side{8 * u + (k & 1 ? 0 : 24), 8 * v + (k & 2 ? 0 : 24), out_u[k], out_v[k], at[k]};
                 by.count += bent[k] < 0.0f;
             }
+            by.ends[u] = by.count;
         }
         return by;
     };
@@ -88,25 +89,38 @@ ANY_HIT = (
     };
     // Which of a chunk's four triangles are not wholly outside, by their boxes and by their corners.
     auto four_within = [&](const Shaft& by, const float* corners) -> unsigned {
-        auto four = [&](int k) -> Four { Four v; __builtin_memcpy(&v, corners + k, sizeof(v)); return v; };
-        FourMask faces;
-        __builtin_memcpy(&faces, corners + 36, sizeof(faces));
-        FourMask out = faces < 0;
-        for (int axis = 0; axis < 3; ++axis) {
-            const Four a = four(4 * axis), b = four(4 * axis + 12), c = four(4 * axis + 24);
-            const Four ab_low = a < b ? a : b, ab_high = a > b ? a : b;
-            out |= ((ab_low < c ? ab_low : c) > by.high[axis]) | ((ab_high > c ? ab_high : c) < by.low[axis]);
-        }
-        for (int k = 0; k < by.count; ++k) {
-            const Side& side = by.sides[k];
-            const int u = (side.row_u % 24) / 2, v = (side.row_v % 24) / 2;
-            auto at = [&](int corner) -> Four { return side.out_u * four(12 * corner + u) + side.out_v * four(12 * corner + v); };
-            const Four a = at(0), b = at(1), c = at(2);
-            const Four ab = a < b ? a : b;
-            out |= (ab < c ? ab : c) > side.at;
-        }
+        // First and second corners together, and third ones.
+        struct Corners { Row ab; Four c; };
+        auto row = [&](int axis) -> Corners {
+            Four a, b, c;
+            __builtin_memcpy(&a, corners + 4 * axis, sizeof(a));
+            __builtin_memcpy(&b, corners + 4 * axis + 12, sizeof(b));
+            __builtin_memcpy(&c, corners + 4 * axis + 24, sizeof(c));
+            return Corners{__builtin_shufflevector(a, b, 0, 1, 2, 3, 4, 5, 6, 7), c};
+        };
+        auto folded_by = [](auto better, const Corners& of) -> Four {
+            return better(better(__builtin_shufflevector(of.ab, of.ab, 0, 1, 2, 3),
+                __builtin_shufflevector(of.ab, of.ab, 4, 5, 6, 7)), of.c);
+        };
+        const Corners x = row(0), y = row(1), z = row(2);
+        FourMask out;
+        __builtin_memcpy(&out, corners + 36, sizeof(out));
+        out = out < 0;
+        auto past = [&](const Corners& of, int axis) {
+            out |= (folded_by(lesser, of) > by.high[axis]) | (folded_by(larger, of) < by.low[axis]);
+        };
+        past(x, 0); past(y, 1); past(z, 2);
+        int k = 0;
+        auto beside = [&](int end, const Corners& u, const Corners& v) {
+            for (; k < end; ++k) {
+                const Side& side = by.sides[k];
+                const Corners at{side.out_u * u.ab + side.out_v * v.ab, side.out_u * u.c + side.out_v * v.c};
+                out |= folded_by(lesser, at) > side.at;
+            }
+        };
+        beside(by.ends[0], x, y); beside(by.ends[1], y, z); beside(by.ends[2], z, x);
         unsigned some = 0;
-        for (int k = 0; k < 4; ++k) some |= (~out[k] & 1) << k;
+        for (int l = 0; l < 4; ++l) some |= (~out[l] & 1) << l;
         return some;
     };
     // GROUPS vectors of rays from `o` along `d`, lanes `live` of them: which meet something nearer than `reach`.

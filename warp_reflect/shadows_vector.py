@@ -188,6 +188,34 @@ CODES += [SAME_TURN, FLATNESS, LEAST_COUNT, SHARP, LEAST_SPREAD, STEEP, TILE]
         istore(number + v * LANES, pixel);
         istore(place + v * LANES, pixel + 2 * neighbours * rows_before + neighbours * line + neighbours);
     }
+    // Where the rays of the next block to shapes start is on its way, too, if it looks as though it sends some.
+    if (pictured && area_count > 0) {
+        const int ahead = tiled ? LANES : BLOCK;
+        bool next_asks = false;
+        for (int k = 0; k < area_count; ++k) {
+            const float* unshadowed = starts.unshadowed.data + k * stride;
+            const unsigned char* of = (sharing || known_samples == 0 ? around.found.data : around.shared.data)
+                + k * (long)around.found.shape[1];
+            unsigned long long all = 0;
+            for (int v = 0; v < GROUPS; ++v) {
+                const int next = own_of[v * LANES] + ahead;
+                __builtin_prefetch(unshadowed + next + ahead);
+                if (count_of[v] == 0) continue;
+                unsigned long long some;
+                __builtin_memcpy(&some, of + place[v * LANES] + LANES, sizeof(some));
+                all |= some;
+                if (only_first) next_asks |= next < stride && unshadowed[next] > 0.0f;
+            }
+            // Some first rays met something there, and some did not.
+            constexpr unsigned long long EACH_BYTE = 0x0101010101010101ull;
+            if (!only_first) next_asks |= (all & EACH_BYTE * dark) != 0 && (all & EACH_BYTE * lit) != 0;
+        }
+        for (int v = 0; v < GROUPS && next_asks; ++v) {
+            const float* next = rows + own_of[v * LANES] + ahead;
+            for (int r = 0; r < 11; ++r)
+                if (r < 6 || r >= 9 || to_all) __builtin_prefetch(next + r * stride);
+        }
+    }
     auto entries = [&](const unsigned char* of, int v, int step) -> Entries {
         Entries e;
         if (straight[v]) __builtin_memcpy(&e, of + place[v * LANES] + step, sizeof(e));
@@ -385,6 +413,14 @@ CODES += [SAME_TURN, FLATNESS, LEAST_COUNT, SHARP, LEAST_SPREAD, STEEP, TILE]
         }
         while (point < asking_count && known_count < ray_count) {
             int used = 0;
+            if (each_once) {
+                used = asking_count;
+                point = asking_count;
+                for (int i = 0; i < used; i += LANES) {
+                    istore(of + i, i + lanes());
+                    istore(which + i, I(sample));
+                }
+            }
             for (; used < together_count && point < asking_count; ++used) {
                 of[used] = point;
                 which[used] = sample;
@@ -464,9 +500,12 @@ CODES += [SAME_TURN, FLATNESS, LEAST_COUNT, SHARP, LEAST_SPREAD, STEEP, TILE]
                         store(arrived_by + at, arrives);
                         continue;
                     }
+                    float each[2][LANES];
+                    store(each[0], brings);
+                    store(each[1], arrives);
                     for (int l = 0; l < LANES && at + l < used; ++l) {
-                        brought_by[order[at + l]] = brings[l];
-                        arrived_by[order[at + l]] = arrives[l];
+                        brought_by[order[at + l]] = each[0][l];
+                        arrived_by[order[at + l]] = each[1][l];
                     }
                 }
             }
@@ -494,13 +533,17 @@ CODES += [SAME_TURN, FLATNESS, LEAST_COUNT, SHARP, LEAST_SPREAD, STEEP, TILE]
             I code = ipick(found_share == 0.0f, I(dark), I(lit | dark));
             code = ipick(found_share == 1.0f, I(lit), code);
             code |= __builtin_convertvector(found_share * (float)levels + 0.5f, I) << 2;
-            for (int l = 0; l < LANES && a + l < asking_count; ++l) {
-                const int j = asking[a + l];
-                share[j] = found_share[l];
-                if (to_sky && brought[a + l] != 0.0f) out_share.data[own_of[j]] = share[j];
-                if (only_first) found[place[j]] = (unsigned char)code[l];
-                else if (sharing) shared[place[j]] = (unsigned char)(code[l] | lit | dark);
-            }
+            // One after the other out of memory: lanes that are named by a variable are kept there anew, each time.
+            float share_of[LANES];
+            int code_of[LANES];
+            store(share_of, found_share);
+            istore(code_of, sharing ? code | (lit | dark) : code);
+            const int some = asking_count - a < LANES ? asking_count - a : LANES;
+            for (int l = 0; l < some; ++l) share[asking[a + l]] = share_of[l];
+            unsigned char* kept = only_first ? found : shared;
+            for (int l = 0; l < some && (only_first || sharing); ++l) kept[place[asking[a + l]]] = (unsigned char)code_of[l];
+            for (int l = 0; l < some && to_sky; ++l)
+                if (brought[a + l] != 0.0f) out_share.data[own_of[asking[a + l]]] = share_of[l];
         }
         for (int j = 0; each && j < BLOCK; ++j) {
             if (j % LANES >= count_of[j / LANES]) continue;
