@@ -75,9 +75,25 @@ def test_what_is_not_black_is_listed_and_everything_counted(device):
     for way in (launch.as_device, launch.recorded):
         with way():
             found, numbers, count = compact.positive(given), compact.every(500, device), compact.counted(marks, 1)
-        np.testing.assert_array_equal(found.numpy(), np.flatnonzero(values.any(axis=1)))
+        np.testing.assert_array_equal(found.numbers.numpy(), np.flatnonzero(values.any(axis=1)))
+        assert found.told() and found.mark is None
         np.testing.assert_array_equal(numbers.numpy(), np.arange(500))
         assert count.numpy().tolist() == [(values[:, 2] > 0.5).sum()]
+
+
+def test_where_nothing_is_read_what_is_not_black_stays_in_its_place(device):
+    values = np.zeros((50, 3), np.float32)
+    values[[7, 30], 1] = 0.5
+    done = []
+    for share in (1.0, 0.0):
+        given = wp.array(share * values, dtype=wp.vec3, device=device)
+        with launch.unread() as plan:
+            found = compact.positive(given)
+            found.then(lambda share=share: done.append(share))
+        expected = np.where((share * values).any(axis=1), np.arange(50), -1)
+        np.testing.assert_array_equal(found.numbers.numpy(), expected)
+        assert found.told() == (share > 0.0) and plan.count == 1
+    assert done == [1.0, 0.0]  # by nobody's decision
 
 
 @pytest.mark.parametrize("count", [1, 32, 33, 5000])

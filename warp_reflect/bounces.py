@@ -218,39 +218,84 @@ def onward(
         vec3 [n]; `seen` itself where no mirror is met. The layer's statistics get `bounced`: rays followed, and
         `bounce_limit`: those whose mirror shows the domes as `bounces` ended there, counted when it is asked for.
     """
-    device, width = scene.device, gbuffer.camera.size[0]
-    index = compact.none(int, device)  # of the first layer's rays; length 0: all
-    weight = compact.none(wp.vec3, device)
-    first, total = layer, seen
-    for depth in range(bounces):
-        asked = meeting(scene, layer, mirrors.patches)
-        n = len(asked)
-        if n == 0:
-            return total
-        point, normal, direction, carried, domes = _reflections(scene, gbuffer, layer, asked, weight, threads)
-        going = compact.positive(carried)
-        if not len(going):
-            return total
-        if total is seen:
-            total = wp.clone(seen)
-        known = [going, asked, point, normal, direction, carried, domes, layer.triangle, layer.pixels.pixel, index]
-        point, normal, direction, weight, domes = (wp.empty(len(going), dtype=wp.vec3, device=device) for _ in range(5))
-        facet, pixel, index = (wp.empty(len(going), dtype=int, device=device) for _ in range(3))
+    walk = _Walk(scene, gbuffer, mirrors, layer, seen, met, bounces, threads, forward, kernels)
+    walk.go_on(0, layer, compact.none(int, scene.device), compact.none(wp.vec3, scene.device))
+    return walk.total
+
+
+class _Walk:
+    """From mirror to mirror, as `onward` has it.
+
+    Attributes:
+        total: What the layer's rays see as far as they were followed.
+    """
+
+    def __init__(self, scene, gbuffer, mirrors, layer, seen, met, bounces, threads, forward, kernels):
+        self._scene, self._gbuffer, self._mirrors, self._first = scene, gbuffer, mirrors, layer
+        self._met, self._bounces, self._threads, self._forward, self._kernels = met, bounces, threads, forward, kernels
+        self._is_own = not launch.reads()  # where it is not known whether a mirror is met, room is made for what may be
+        self.total = wp.clone(seen) if self._is_own else seen
+
+    def go_on(
+        self, depth: int, layer: ReflectionLayer, index: wp.array, weight: wp.array, going: compact.Some | None = None
+    ) -> None:
+        """Follow what mirrors reflect of a layer's rays.
+
+        Args:
+            depth: Reflections so far.
+            layer: Of the last ones.
+            index: int32, their numbers among the first layer's rays; length 0: they are these.
+            weight: vec3, what they carry; length 0: all of what they see.
+            going: The rays before that these are the reflections of.
+        """
+        scene, gbuffer, threads = self._scene, self._gbuffer, self._threads
+        if depth == self._bounces:
+            ended = partial(_ended, scene, gbuffer, self._mirrors, layer, weight, index, going, threads)
+            self._first.count_later("bounce_limit", ended)
+            return
+        asked = meeting(scene, layer, self._mirrors.patches)
+        if not len(asked.numbers):
+            return
+        rays = _reflections(scene, gbuffer, layer, asked.numbers, weight, threads)
+        going = compact.positive(rays[3])
+        going.then(partial(self._follow, depth, layer, index, asked.numbers, going, rays))
+
+    def _follow(
+        self,
+        depth: int,
+        layer: ReflectionLayer,
+        index: wp.array,
+        asked: wp.array,
+        going: compact.Some,
+        rays: list[wp.array],
+    ) -> None:
+        scene, device, threads, kernels = self._scene, self._scene.device, self._threads, self._kernels
+        width, bodies, count = self._gbuffer.camera.size[0], self._mirrors.bodies, len(going.numbers)
+        if not self._is_own:
+            self.total, self._is_own = wp.clone(self.total), True
+        known = [going.numbers, asked, *rays, layer.triangle, layer.pixels.pixel, index]
+        point, normal, direction, weight, domes = (wp.empty(count, dtype=wp.vec3, device=device) for _ in range(5))
+        facet, pixel, index = (wp.empty(count, dtype=int, device=device) for _ in range(3))
         taken = [point, normal, direction, weight, domes, facet, pixel, index]
-        launch.launch(take_rays_kernel, len(going), [*known, *taken], device, threads)
-        first.count_later("bounced", index.numpy)
+        launch.launch(take_rays_kernel, count, [*known, *taken], device, threads)
+        self._first.count_later("bounced", partial(_numbers, index, going))
         pixels = MirrorPixels(layer.pixels.reflector, pixel, point, normal, direction, layer.pixels.box)
-        make = ReflectionLayer.unset if forward is None or depth else ReflectionLayer.empty
-        layer = make(pixels, Technique.RAYTRACED, device)
-        if forward is not None and depth == 0:
-            forward(layer, facet)
-            _trace_others(scene, layer, facet, mirrors.bodies, threads, kernels, width)
-            add_statistics(first.statistics, layer.statistics)
+        first = self._forward is not None and depth == 0
+        layer = (ReflectionLayer.empty if first else ReflectionLayer.unset)(pixels, Technique.RAYTRACED, device)
+        if first:
+            self._forward(layer, facet)
+            _trace_others(scene, layer, facet, bodies, threads, kernels, width)
+            add_statistics(self._first.statistics, layer.statistics)
         else:
-            bvh.trace_bounced(scene, layer, facet, mirrors.bodies, threads, kernels, width)
-        launch.launch(add_bounce_kernel, len(going), [index, weight, domes, met(layer), total], device, threads)
-    first.count_later("bounce_limit", partial(_ended, scene, gbuffer, mirrors, layer, weight, index, threads))
-    return total
+            bvh.trace_bounced(scene, layer, facet, bodies, threads, kernels, width)
+        inputs = [index, weight, domes, self._met(layer), self.total]
+        launch.launch(add_bounce_kernel, count, inputs, device, threads)
+        self.go_on(depth + 1, layer, index, weight, going)
+
+
+def _numbers(index: wp.array, going: compact.Some) -> np.ndarray:
+    """The numbers of rays that go on; read now."""
+    return index.numpy() if going.told() else np.zeros(0, np.int32)
 
 
 def _reflections(
@@ -275,14 +320,17 @@ def _ended(
     layer: ReflectionLayer,
     weight: wp.array,
     index: wp.array,
+    going: compact.Some,
     threads: int,
 ) -> np.ndarray:
     """Of the last rays that are followed those that meet a mirror again, as numbers of the first layer's."""
-    asked = meeting(scene, layer, mirrors.patches)
+    if not going.told():
+        return np.zeros(0, np.int32)
+    asked = meeting(scene, layer, mirrors.patches).numbers
     if not len(asked):
         return asked.numpy()
     *_, carried, _ = _reflections(scene, gbuffer, layer, asked, weight, threads)
-    return compact.taken(index, compact.taken(asked, compact.positive(carried))).numpy()
+    return compact.taken(index, compact.taken(asked, compact.positive(carried).numbers)).numpy()
 
 
 def _trace_others(

@@ -220,12 +220,19 @@ def trace_onward_kernel(
     out_distance: wp.array(dtype=float),
     out_status: wp.array(dtype=wp.uint8),
 ):
-    """One thread per asked ray."""
+    """One thread per asked ray; one without a facet meets nothing."""
     i = first + wp.tid()
     if indexed != 0:
         i = index[i]
         if i < 0:
             return
+    if facet[i] < 0:
+        out_triangle[i] = -1
+        out_u[i] = 0.0
+        out_v[i] = 0.0
+        out_distance[i] = 0.0
+        out_status[i] = wp.uint8(NONE)
+        return
     met = answered(known, out_triangle[i], out_u[i], out_v[i], out_distance[i])
     hit = trace_onward(mesh_id, scene, point[i], direction[i], normal[i], facet[i], int(inside[i]), 0.0, met)
     out_triangle[i] = hit.triangle

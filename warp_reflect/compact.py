@@ -6,13 +6,14 @@ at hand anyway NumPy finds the numbers faster than kernels do.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
 import warp as wp
 
-from warp_reflect.launch import launch, reads, stays
+from warp_reflect.launch import launch, mark, reads, stays, when
 
 wp.set_module_options({"enable_backward": False})
 
@@ -87,6 +88,30 @@ def padded(marks: wp.array, value: int) -> tuple[wp.array, wp.array]:
     return numbers, ends[len(ends) - 1 :]
 
 
+@dataclass(frozen=True)
+class Some:
+    """Some elements of an array.
+
+    Attributes:
+        numbers: int32, ascending; where nothing is read the array's whole length, with -1 for every other element.
+        mark: int32 [1], set where there is any; None: `numbers` has a length.
+    """
+
+    numbers: wp.array
+    mark: wp.array | None = None
+
+    def then(self, work: Callable[[], None]) -> None:
+        """Do what is to be done where there is any."""
+        if self.mark is not None:
+            when(self.mark, work)
+        elif len(self.numbers):
+            work()
+
+    def told(self) -> bool:
+        """Whether there is any; read now."""
+        return len(self.numbers) > 0 if self.mark is None else bool(self.mark.numpy()[0])
+
+
 @wp.kernel
 def positive_kernel(first: int, values: wp.array(dtype=wp.vec3), out_mark: wp.array(dtype=wp.uint8)):
     """One thread per element: 1 where any of its numbers is above 0."""
@@ -94,17 +119,31 @@ def positive_kernel(first: int, values: wp.array(dtype=wp.vec3), out_mark: wp.ar
     out_mark[i] = wp.uint8(wp.where(wp.max(values[i]) > 0.0, 1, 0))
 
 
-def positive(values: wp.array) -> wp.array:
-    """Ascending numbers of the elements of a vec3 array, none of whose numbers is below 0, that are not 0, int32.
+@wp.kernel
+def positive_here_kernel(
+    first: int, values: wp.array(dtype=wp.vec3), out_number: wp.array(dtype=int), out_mark: wp.array(dtype=int)
+):
+    """One thread per element: its number where any of its own is above 0, else -1; threads that set the mark agree."""
+    i = first + wp.tid()
+    out_number[i] = -1
+    if wp.max(values[i]) > 0.0:
+        out_number[i] = i
+        out_mark[0] = 1
 
-    Where nothing is read -1 stands behind them, see `padded`.
-    """
-    if not stays(values.device):
+
+def positive(values: wp.array) -> Some:
+    """The elements of a vec3 array, none of whose numbers is below 0, that are not 0."""
+    device = values.device
+    if not stays(device):
         x, y, z = values.numpy().T
-        return listed(np.flatnonzero(x + y + z > 0.0), values.device)
-    marks = wp.empty(len(values), dtype=wp.uint8, device=values.device)
-    launch(positive_kernel, len(values), [values, marks], values.device)
-    return marked(marks, 1) if reads() else padded(marks, 1)[0]
+        return Some(listed(np.flatnonzero(x + y + z > 0.0), device))
+    if not reads():
+        numbers, some = wp.empty(len(values), dtype=int, device=device), mark(device)
+        launch(positive_here_kernel, len(values), [values, numbers, some], device)
+        return Some(numbers, some)
+    marks = wp.empty(len(values), dtype=wp.uint8, device=device)
+    launch(positive_kernel, len(values), [values, marks], device)
+    return Some(marked(marks, 1))
 
 
 @wp.kernel

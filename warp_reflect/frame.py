@@ -66,7 +66,7 @@ class Frame:
         picture: tuple,
         timings: Mapping[str, float],
         previous: Frame | None = None,
-        transmitted: dict[int, transmission.Transmission] | None = None,
+        transmitted: Mapping[int, transmission.Transmission] | None = None,
         kept: frozenset[int] = frozenset(),
     ):
         # Not the previous frame itself: each would keep the one before it alive.
@@ -76,7 +76,7 @@ class Frame:
         self._timings = timings
         self._picture = picture
         self.kept = kept
-        self.transmitted = transmitted or {}
+        self.transmitted = {} if transmitted is None else transmitted
         self.lasts, self.gone = True, False
 
     @cached_property

@@ -111,21 +111,66 @@ def stays(device) -> bool:
 
 def reads() -> bool:
     """Whether a device may be asked for a number: not where its work is only written down (`unread`)."""
-    return not getattr(_unread, "depth", 0)
+    return getattr(_unread, "plan", None) is None
+
+
+class Unread:
+    """Work that is written down to be done later, and again.
+
+    Attributes:
+        marks: int32, one for each place (`mark`) that decides what is done after it; all 0 before the work. None: they are
+            still counted, and all is done.
+        is_last: Whether the work is written down; before that, once is enough of what is repeated.
+        count: Of such places.
+    """
+
+    def __init__(self, marks: wp.array | None = None, is_last: bool = True):
+        self.marks, self.is_last, self.count = marks, is_last, 0
 
 
 @contextmanager
-def unread() -> Iterator[None]:
+def unread(marks: wp.array | None = None, is_last: bool = True) -> Iterator[Unread]:
     """In the context the calling thread reads nothing from a device, whose work is written down to be done later, and again.
 
     Launches go over the most that there can be, and their threads look at what there is. A CPU goes a CUDA device's way
     (`stays`), with plain kernels.
     """
-    _unread.depth = getattr(_unread, "depth", 0) + 1
+    before, _unread.plan = getattr(_unread, "plan", None), Unread(marks, is_last)
     try:
-        yield
+        yield _unread.plan
     finally:
-        _unread.depth -= 1
+        _unread.plan = before
+
+
+def mark(device) -> wp.array:
+    """Where nothing is read: int32 [1], 0 before the work that is written down, for one kernel of it to set."""
+    plan = _unread.plan
+    plan.count += 1
+    if plan.marks is None:
+        return wp.zeros(1, dtype=int, device=device)
+    return plan.marks[plan.count - 1 : plan.count]
+
+
+def when(mark: wp.array, work: Callable[[], None]) -> None:
+    """Where nothing is read: launch what is to be done where a mark is set then; always where devices decide nothing."""
+    if _unread.plan.marks is None:
+        work()
+    else:
+        wp.capture_if(mark, on_true=work)
+
+
+def while_marked(mark: wp.array, work: Callable[[], None], most: int) -> None:
+    """The same as long as a mark is set, which the work sets anew.
+
+    Args:
+        mark, work: See `when`.
+        most: Times that it is set, at most.
+    """
+    if _unread.plan.marks is not None:
+        wp.capture_while(mark, while_body=work)
+        return
+    for _ in range(most if _unread.plan.is_last else 1):
+        work()
 
 
 @contextmanager

@@ -16,7 +16,7 @@ import warp as wp
 
 from warp_reflect import compact
 from warp_reflect.counts import Statistics
-from warp_reflect.launch import launch, module_part, reads, stays
+from warp_reflect.launch import launch, mark, module_part, reads, stays
 from warp_reflect.scene import CameraData, Scene
 from warp_reflect.settings import Status
 
@@ -473,19 +473,41 @@ def met_kernel(
         out_met[i] = patches[triangle_patch[triangle[i]]]
 
 
-def meeting(scene: Scene, layer: ReflectionLayer, patches: np.ndarray) -> wp.array:
-    """Which rays of a layer meet one of the patches, bool [patches of the scene]: ascending, see `compact.padded`."""
+@wp.kernel(module=UNREAD)
+def met_here_kernel(
+    first: int,
+    triangle: wp.array(dtype=int),
+    triangle_patch: wp.array(dtype=int),
+    patches: wp.array(dtype=wp.uint8),
+    out_number: wp.array(dtype=int),
+    out_mark: wp.array(dtype=int),
+):
+    """One thread per ray: its number where it meets one of the patches, else -1; threads that set the mark agree."""
+    i = first + wp.tid()
+    out_number[i] = -1
+    if triangle[i] >= 0:
+        if patches[triangle_patch[triangle[i]]] != wp.uint8(0):
+            out_number[i] = i
+            out_mark[0] = 1
+
+
+def meeting(scene: Scene, layer: ReflectionLayer, patches: np.ndarray) -> compact.Some:
+    """Which rays of a layer meet one of the patches, bool [patches of the scene]."""
     if stays(scene.device):
         of_patch = scene.kept_always(
             ("patches", patches.tobytes()),
             lambda: wp.array(patches.astype(np.uint8), dtype=wp.uint8, device=scene.device),
         )
-        met = wp.empty(layer.pixels.count, dtype=wp.uint8, device=scene.device)
-        inputs = [layer.triangle, scene.view.triangle_patch, of_patch, met]
-        launch(met_kernel, len(met), inputs, scene.device)
-        return compact.padded(met, 1)[0]
+        inputs, count = [layer.triangle, scene.view.triangle_patch, of_patch], layer.pixels.count
+        if not reads():
+            numbers, some = wp.empty(count, dtype=int, device=scene.device), mark(scene.device)
+            launch(met_here_kernel, count, [*inputs, numbers, some], scene.device)
+            return compact.Some(numbers, some)
+        met = wp.empty(count, dtype=wp.uint8, device=scene.device)
+        launch(met_kernel, count, [*inputs, met], scene.device)
+        return compact.Some(compact.marked(met, 1))
     of_triangle = scene.kept_always(
         ("triangles of patches", patches.tobytes()),
         lambda: np.append(patches.take(scene.host_triangle_patch), False),  # the last is that of triangle -1
     )
-    return compact.listed(np.flatnonzero(of_triangle.take(layer.triangle.numpy())), scene.device)
+    return compact.Some(compact.listed(np.flatnonzero(of_triangle.take(layer.triangle.numpy())), scene.device))

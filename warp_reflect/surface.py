@@ -420,9 +420,14 @@ def part_pixels(
     found = {part: known[part] for part in parts if part in known}
     others = [part for part in parts if part not in known]
     if others:
-        pixel, runs, _ = _pixels_of(scene, gbuffer, dict(enumerate(others, 1)), threads, kernels)
+        asked = dict(enumerate(others, 1))
+        if not launch.reads():
+            ids = _ids(scene, gbuffer, asked, threads, "others")
+            own = _unread_pixels(scene, gbuffer, ids, asked)
+            return found | {part: replace(own[id], reflector=NO_REFLECTOR) for id, part in asked.items()}
+        pixel, runs, _ = _pixels_of(scene, gbuffer, asked, threads, kernels)
         whole = _met(scene, gbuffer, pixel, threads, kernels)
-        found |= {part: whole.part(NO_REFLECTOR, *runs[id]) for id, part in enumerate(others, 1)}
+        found |= {part: whole.part(NO_REFLECTOR, *runs[id]) for id, part in asked.items()}
     return {part: pixels for part, pixels in found.items() if pixels.count}
 
 
@@ -446,6 +451,12 @@ def _pixels_by_id(ids: np.ndarray, wanted: Collection[int]) -> tuple[np.ndarray,
 
 
 RUN = wp.constant(6)  # numbers of an id's run: first, end; first and last row; columns left of the right end, its end
+
+
+@wp.func
+def run_box(run: wp.array(dtype=int), width: int) -> wp.vec4i:
+    """Bounds of an id's pixels on the device, as `_box` on the host; of a picture of that width."""
+    return wp.vec4i(width - run[4], run[2], run[5], run[3] + 1)
 
 
 @wp.kernel(module=SORTED)

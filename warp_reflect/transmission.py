@@ -20,7 +20,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import warp as wp
@@ -315,8 +316,15 @@ def cross_seen_kernel(
     out_inside: wp.array(dtype=wp.uint8),
     out_weight: wp.array(dtype=wp.vec3),
 ):
-    """One thread per pixel that shows a transparent surface."""
+    """One thread per pixel that shows a transparent surface; a ray of no facet where the number is -1."""
     i = first + wp.tid()
+    if pixel[i] < 0:
+        out_facet[i] = -1
+        out_normal[i] = wp.vec3(0.0, 0.0, 0.0)
+        out_direction[i] = wp.vec3(0.0, 0.0, 0.0)
+        out_inside[i] = wp.uint8(0)
+        out_weight[i] = wp.vec3(0.0, 0.0, 0.0)
+        return
     cross_pixel(
         scene,
         camera[0],
@@ -365,8 +373,10 @@ def cross_hits_kernel(
     direction: wp.array(dtype=wp.vec3),
     fading: wp.array(dtype=int),
     weight: wp.array(dtype=wp.vec3),
+    # Surfaces before; those that are counted on the device are added:
     depth: int,
-    # Outputs:
+    deeper: wp.array(dtype=int),
+    # Outputs, which what they replace may lie in:
     out_own: wp.array(dtype=wp.vec3),
     out_faded: wp.array(dtype=wp.vec3),
     out_point: wp.array(dtype=wp.vec3),
@@ -380,13 +390,22 @@ def cross_hits_kernel(
     i = first + wp.tid()
     tri = triangle[i]
     left = weight[i]
-    if fading.shape[0] > 0 and fading[i] >= 0:
+    d = direction[i]
+    nothing = wp.vec3(0.0, 0.0, 0.0)
+    out_faded[i] = nothing
+    out_point[i] = nothing
+    out_normal[i] = nothing
+    out_direction[i] = nothing
+    out_inside[i] = wp.uint8(0)
+    out_weight[i] = nothing
+    if fading.shape[0] > 0:
         # The patch that the ray came through last.
-        veil = interfaces[fading[i]]
-        share = fade_share(veil, tri, distance[i])
-        out_faded[i] = (1.0 - share) * wp.cw_mul(left, veil.fade_color)
-        left = share * left
         out_fading[i] = fading[i]
+        if fading[i] >= 0:
+            veil = interfaces[fading[i]]
+            share = fade_share(veil, tri, distance[i])
+            out_faded[i] = (1.0 - share) * wp.cw_mul(left, veil.fade_color)
+            left = share * left
     out_own[i] = left
     if tri < 0:
         return
@@ -394,7 +413,6 @@ def cross_hits_kernel(
     interface = interfaces[patch]
     if interface.kind == OPAQUE:
         return
-    d = direction[i]
     corner = scene.triangles[tri]
     p = (1.0 - u[i] - v[i]) * scene.points[corner[0]] + u[i] * scene.points[corner[1]] + v[i] * scene.points[corner[2]]
     n = hit_normal(scene, tri, u[i], v[i])
@@ -413,7 +431,10 @@ def cross_hits_kernel(
         look = plain_look(scene, tri, u[i], v[i])
     disc = wp.vec2(0.0, 0.0)
     if interface.spread > 0.0:
-        disc = disc_sample(pixel[i], depth, 1)
+        surfaces = int(depth)
+        if deeper.shape[0] > 0:
+            surfaces += deeper[0]
+        disc = disc_sample(pixel[i], surfaces, 1)
     crossing = cross_interface(scene, interface, look, tri, n, d, shaded, False, disc)
     out_own[i] = crossing.own * left
     carried = wp.cw_mul(left, crossing.weight)
@@ -435,12 +456,59 @@ def gather_kernel(
     own: wp.array(dtype=wp.vec3),
     faded: wp.array(dtype=wp.vec3),
     seen: wp.array(dtype=wp.vec3),
+    begins: int,
     # Outputs:
     out_total: wp.array(dtype=wp.vec3),
 ):
-    """One thread per ray; each adds to the total of its own pixel."""
+    """One thread per ray, but for the number -1; each adds to the total of its own pixel, which may begin with it."""
     i = first + wp.tid()
-    out_total[index[i]] += faded[i] + wp.cw_mul(own[i], seen[i])
+    k = index[i]
+    if k < 0:
+        return
+    total = wp.vec3(0.0, 0.0, 0.0)
+    if begins == 0:
+        total = out_total[k]
+    out_total[k] = total + (faded[i] + wp.cw_mul(own[i], seen[i]))
+
+
+@wp.kernel
+def next_surface_kernel(first: int, out_depth: wp.array(dtype=int), out_mark: wp.array(dtype=int)):
+    """One thread: one surface more; of no ray is known yet whether it goes on behind that."""
+    out_depth[first + wp.tid()] += 1
+    out_mark[0] = 0
+
+
+@wp.kernel
+def still_kernel(
+    first: int,
+    weight: wp.array(dtype=wp.vec3),
+    triangle: wp.array(dtype=int),
+    depth: wp.array(dtype=int),
+    limit: int,
+    # Changed; facets of the rays that go on, -1 of others; how often each went on, and whether the limit ended it:
+    out_pixel: wp.array(dtype=int),
+    out_number: wp.array(dtype=int),
+    out_facet: wp.array(dtype=int),
+    out_onward: wp.array(dtype=wp.uint16),
+    out_ended: wp.array(dtype=wp.uint8),
+    out_mark: wp.array(dtype=int),
+    out_counted: wp.array(dtype=int),
+):
+    """One thread per ray; threads that set the marks, that any goes on and that any is counted, agree."""
+    i = first + wp.tid()
+    goes = wp.max(weight[i]) > 0.0
+    if goes:
+        out_counted[0] = 1
+    if goes and depth[0] >= limit:
+        out_ended[i] = wp.uint8(1)
+        goes = bool(False)
+    out_facet[i] = wp.where(goes, triangle[i], -1)
+    if not goes:
+        out_pixel[i] = -1
+        out_number[i] = -1
+        return
+    out_onward[i] = out_onward[i] + wp.uint16(1)
+    out_mark[0] = 1
 
 
 @wp.kernel
@@ -456,8 +524,10 @@ def nearness_kernel(
     out_way: wp.array(dtype=float),
     out_nearness: wp.array(dtype=wp.vec2),
 ):
-    """One thread per ray: how near what it met is, weighted by what is not seen through that."""
+    """One thread per ray, but for the number -1: how near what it met is, weighted by what is not seen through that."""
     i = first + wp.tid()
+    if index[i] < 0:
+        return
     way = distance[i]
     if before.shape[0] > 0:
         way += before[i]
@@ -492,7 +562,7 @@ def met_kernel(
 ):
     """One thread per ray that has met something opaque or nothing: it, faded, and how near it is."""
     i = first + wp.tid()
-    if fading.shape[0] > 0:
+    if fading.shape[0] > 0 and fading[i] >= 0:
         veil = interfaces[fading[i]]
         share = fade_share(veil, triangle[i], distance[i])
         out_total[i] = share * seen[i] + (1.0 - share) * veil.fade_color
@@ -510,8 +580,10 @@ def transmitted_term_kernel(
     radiance: wp.array(dtype=wp.vec3),
     out_picture: wp.array(dtype=wp.vec4),
 ):
-    """One thread per pixel that shows a transparent surface."""
+    """One thread per pixel that shows a transparent surface, but for the number -1."""
     i = first + wp.tid()
+    if pixel[i] < 0:
+        return
     term = wp.cw_mul(weight[i], radiance[i])
     out_picture[pixel[i]] += wp.vec4(term[0], term[1], term[2], 0.0)
 
@@ -551,13 +623,14 @@ def look_through(
         vector.launch_blocks(transmission_vector.cross_blocks_kernel, n, inputs, device, threads)
     else:
         launch.launch(cross_seen_kernel, n, [scene.view, *inputs, *outputs], device, threads)
-    pixels = MirrorPixels(NO_REFLECTOR, surface.pixel, surface.point, normal, direction, surface.box)
-    layer = ReflectionLayer.empty(pixels, Technique.RAYTRACED, device)
+    pixels = replace(surface.turned(direction, normal), reflector=NO_REFLECTOR)
+    make = ReflectionLayer.unset if follow is None else ReflectionLayer.empty
+    layer = make(pixels, Technique.RAYTRACED, device)
     if follow is not None:
         follow(layer, facet, inside)
     else:
         bvh.trace_transmitted(scene, layer, facet, inside, threads, None, settings.kernels, gbuffer.camera.size[0])
-    return Transmission(surface, layer, weight, inside, wp.zeros(n, dtype=float, device=device))
+    return Transmission(surface, layer, weight, inside, wp.empty(n, dtype=float, device=device))
 
 
 def through_radiance(scene: Scene, through: Through, found: Transmission, settings: Settings) -> wp.array:
@@ -566,10 +639,31 @@ def through_radiance(scene: Scene, through: Through, found: Transmission, settin
     seen = through.met(found.layer)
     patches = None
     if interfaces.fades:
-        facets = compact.taken(gbuffer.triangle, found.layer.pixels.pixel)
-        patches = compact.taken(scene.view.triangle_patch, facets)
+        patches = _patches(scene, gbuffer, found.surface.pixel, settings.threads)
     asked = [interfaces, found.layer, seen, settings, through.met, patches, found.nearness]
     return behind(scene, gbuffer, *asked)
+
+
+@wp.kernel
+def patch_kernel(
+    first: int,
+    triangle: wp.array(dtype=int),
+    triangle_patch: wp.array(dtype=int),
+    pixel: wp.array(dtype=int),
+    out_patch: wp.array(dtype=int),
+):
+    """One thread per pixel of a surface: the patch there; -1 where there is none."""
+    i = first + wp.tid()
+    out_patch[i] = -1
+    if pixel[i] >= 0:
+        out_patch[i] = triangle_patch[triangle[pixel[i]]]
+
+
+def _patches(scene: Scene, gbuffer: GBuffer, pixel: wp.array, threads: int) -> wp.array:
+    patches = wp.empty(len(pixel), dtype=int, device=scene.device)
+    inputs = [gbuffer.triangle, scene.view.triangle_patch, pixel, patches]
+    launch.launch(patch_kernel, len(pixel), inputs, scene.device, threads)
+    return patches
 
 
 def behind(
@@ -600,72 +694,184 @@ def behind(
         vec3 [n]; `seen` itself where nothing is transparent. The layer's statistics get `onward`: rays followed, and
         `depth_limit`: those that `transparency_depth` ended (through the surface they met nothing is seen).
     """
-    device, threads = scene.device, settings.threads
-    count = layer.pixels.count
-    if not len(meeting(scene, layer, interfaces.clear)):
-        if patches is None and nearness is None:
-            return seen
-        total = wp.empty(count, dtype=wp.vec3, device=device) if patches is not None else seen
+    met_any = meeting(scene, layer, interfaces.clear)
+    walk = _Walk(scene, gbuffer, interfaces, layer, seen, settings, met, patches, nearness)
+    if not launch.reads() or not len(met_any.numbers):
+        walk.end_here()
+    met_any.then(walk.begin)
+    return walk.total
+
+
+class _Walk:
+    """From surface to surface, as `behind` has it.
+
+    Attributes:
+        total: What the layer's rays see as far as they were followed.
+    """
+
+    def __init__(self, scene, gbuffer, interfaces, layer, seen, settings, met, patches, nearness):
+        self._scene, self._gbuffer, self._interfaces, self._first, self._seen = scene, gbuffer, interfaces, layer, seen
+        self._settings, self._met, self._patches, self._nearness = settings, met, patches, nearness
+        self._near: wp.array | None = None
+        self.total = seen
+
+    def end_here(self) -> None:
+        """Nothing transparent is met, or it is not known yet whether it is."""
+        device, patches, nearness, layer = self._scene.device, self._patches, self._nearness, self._first
+        if patches is None and nearness is None and launch.reads():
+            return
+        if patches is not None:
+            self.total = wp.empty(layer.pixels.count, dtype=wp.vec3, device=device)
+        elif not launch.reads():
+            self.total = wp.clone(self._seen)
         near = compact.none(float, device) if nearness is None else nearness
         given = patches if patches is not None else compact.none(int, device)
-        inputs = [interfaces.views, given, layer.triangle, layer.distance, seen]
-        launch.launch(met_kernel, count, [*inputs, total, near], device, threads)
-        return total
-    numbers = compact.every(count, device)  # of the first layer's rays
-    weight = wp.full(count, wp.vec3(1.0, 1.0, 1.0), dtype=wp.vec3, device=device)
-    fading = wp.full(count if interfaces.fades else 0, -1, dtype=int, device=device)
-    if interfaces.fades and patches is not None:
-        fading = patches
-    way = compact.none(float, device)
-    near = wp.zeros(count, dtype=wp.vec2, device=device) if nearness is not None else None
-    total, first = None, layer
-    for depth in range(settings.transparency_depth + 1):
-        n = layer.pixels.count
+        if len(given) or len(near):
+            inputs = [self._interfaces.views, given, layer.triangle, layer.distance, self._seen, self.total, near]
+            launch.launch(met_kernel, layer.pixels.count, inputs, device, self._settings.threads)
+
+    def begin(self) -> None:
+        """Go on behind what the first rays have met."""
+        count, device, fades = self._first.pixels.count, self._scene.device, self._interfaces.fades
+        weight = wp.full(count, wp.vec3(1.0, 1.0, 1.0), dtype=wp.vec3, device=device)
+        fading = self._patches
+        if fading is None or not fades:
+            fading = wp.full(count if fades else 0, -1, dtype=int, device=device)
+        if self._nearness is not None:
+            self._near = wp.zeros(count, dtype=wp.vec2, device=device)
+        numbers = compact.every(count, device)  # of the first layer's rays
+        self._cross(0, self._first, self._seen, numbers, weight, fading, compact.none(float, device))
+        if self._near is not None:
+            inputs = [self._near, self._nearness]
+            launch.launch(mean_nearness_kernel, count, inputs, device, self._settings.threads)
+
+    def _cross(
+        self,
+        depth: int,
+        layer: ReflectionLayer,
+        seen: wp.array,
+        numbers: wp.array,
+        weight: wp.array,
+        fading: wp.array,
+        way: wp.array,
+    ) -> None:
+        """Add what rays see, and lead them through what they have met.
+
+        Args:
+            depth: Surfaces so far.
+            layer, seen: Rays and what they met; radiance of that.
+            numbers: int32, theirs among the first layer's.
+            weight: vec3, what they carry.
+            fading: int32, the patch that each has come through, -1 none; length 0: nothing fades.
+            way: float, the length of their way so far; length 0: none.
+        """
+        device, n = self._scene.device, layer.pixels.count
+        point, normal, direction, carried = (wp.empty(n, dtype=wp.vec3, device=device) for _ in range(4))
+        inside = wp.empty(n, dtype=wp.uint8, device=device)
+        still_fading = wp.empty(len(fading), dtype=int, device=device)
+        further = wp.empty(n if self._near is not None else 0, dtype=float, device=device)
+        behind = point, normal, direction, inside, carried, still_fading, further
+        none = compact.none(int, device)
+        own, faded = self._lead(depth, none, layer, numbers, (weight, fading, way), behind)
+        gather = partial(self._gather, depth, numbers, own, faded, seen)
+        going = compact.positive(carried)
+        onward = partial(self._go_on, depth, layer, numbers, going, behind)
+        if depth > 0 or (self._interfaces.fades and self._patches is not None):
+            gather()
+            going.then(onward)
+        else:
+            # Where nothing goes on, what is seen is all of it.
+            going.then(partial(_both, gather, onward))
+
+    def _lead(self, depth: int, deeper: wp.array, layer: ReflectionLayer, numbers: wp.array, carried, behind) -> tuple:
+        """Lead rays through what they have met; what they see there by itself, and what faded before it.
+
+        Args:
+            depth, deeper, layer, numbers: See `_cross` and `cross_hits_kernel`.
+            carried: Weight, patch and way of rays.
+            behind: Gets points, normals, directions, whether they are inside, weights, patches and ways, which may be the same.
+        """
+        scene, gbuffer, threads, n = self._scene, self._gbuffer, self._settings.threads, layer.pixels.count
+        weight, fading, way = carried
+        point, normal, direction, inside, carried, still_fading, further = behind
         looks = prepare_looks(scene, gbuffer, layer, threads)
         normals = prepare_normals(scene, gbuffer, layer, threads)
-        own, faded, point, normal, direction, carried = (wp.zeros(n, dtype=wp.vec3, device=device) for _ in range(6))
-        inside = wp.zeros(n, dtype=wp.uint8, device=device)
-        still_fading = wp.full(len(fading), -1, dtype=int, device=device)
-        inputs = [scene.view, interfaces.views, looks, normals, layer.triangle, layer.u, layer.v, layer.distance]
-        inputs += [layer.pixels.pixel, layer.pixels.direction, fading, weight, depth]
+        own, faded = (wp.empty(n, dtype=wp.vec3, device=scene.device) for _ in range(2))
+        inputs = [scene.view, self._interfaces.views, looks, normals, layer.triangle, layer.u, layer.v, layer.distance]
+        inputs += [layer.pixels.pixel, layer.pixels.direction, fading, weight, depth, deeper]
         outputs = [own, faded, point, normal, direction, inside, carried, still_fading]
-        launch.launch(cross_hits_kernel, n, inputs + outputs, device, threads)
-        going = compact.positive(carried)
-        if near is not None:
-            before, way = way, wp.empty(n, dtype=float, device=device)
-            ways = [numbers, layer.triangle, layer.distance, own, carried, before, way, near]
-            launch.launch(nearness_kernel, n, ways, device, threads)
-        if total is None:
-            if not len(going) and not (interfaces.fades and patches is not None):
-                total = seen
-                break
-            total = wp.zeros(count, dtype=wp.vec3, device=device)
-        launch.launch(gather_kernel, n, [numbers, own, faded, seen, total], device, threads)
-        if depth == settings.transparency_depth:
-            first.count_later("depth_limit", compact.taken(numbers, going).numpy)
-            break
-        if not len(going):
-            break
-        taken = lambda array: compact.taken(array, going)  # noqa: B023, E731
-        numbers, weight = taken(numbers), taken(carried)
-        first.count_later("onward", numbers.numpy)
-        fading = taken(still_fading) if len(fading) else fading
-        way = taken(way) if len(way) else way
-        pixels = MirrorPixels(
-            layer.pixels.reflector,
-            taken(layer.pixels.pixel),
-            taken(point),
-            taken(normal),
-            taken(direction),
-            layer.pixels.box,
-        )
-        facet, inside = taken(layer.triangle), taken(inside)
-        layer = ReflectionLayer.empty(pixels, Technique.RAYTRACED, device)
-        bvh.trace_transmitted(scene, layer, facet, inside, threads, None, settings.kernels, gbuffer.camera.size[0])
-        seen = met(layer)
-    if near is not None:
-        launch.launch(mean_nearness_kernel, count, [near, nearness], device, threads)
-    return total
+        launch.launch(cross_hits_kernel, n, inputs + outputs, scene.device, threads)
+        if self._near is not None:
+            ways = [numbers, layer.triangle, layer.distance, own, carried, way, further, self._near]
+            launch.launch(nearness_kernel, n, ways, scene.device, threads)
+        return own, faded
+
+    def _gather(self, depth: int, numbers: wp.array, own: wp.array, faded: wp.array, seen: wp.array) -> None:
+        device = self._scene.device
+        if self.total is self._seen:
+            self.total = wp.empty(self._first.pixels.count, dtype=wp.vec3, device=device)
+        inputs = [numbers, own, faded, seen, int(depth == 0), self.total]
+        launch.launch(gather_kernel, len(numbers), inputs, device, self._settings.threads)
+
+    def _go_on(self, depth: int, layer: ReflectionLayer, numbers: wp.array, going: compact.Some, behind: tuple) -> None:
+        if going.mark is not None:
+            self._repeat(layer, numbers, going, behind)
+            return
+        rays = numbers, layer.pixels.pixel, layer.triangle, *behind
+        taken = [compact.taken(array, going.numbers) if len(array) else array for array in rays]
+        if depth == self._settings.transparency_depth:
+            self._first.count_later("depth_limit", taken[0].numpy)
+            return
+        numbers, pixel, facet, point, normal, direction, inside, *carried = taken
+        self._first.count_later("onward", numbers.numpy)
+        pixels = MirrorPixels(layer.pixels.reflector, pixel, point, normal, direction, layer.pixels.box)
+        layer = self._trace(pixels, facet, inside)
+        self._cross(depth + 1, layer, self._met(layer), numbers, *carried)
+
+    def _trace(self, pixels: MirrorPixels, facet: wp.array, inside: wp.array) -> ReflectionLayer:
+        scene, settings, width = self._scene, self._settings, self._gbuffer.camera.size[0]
+        layer = ReflectionLayer.unset(pixels, Technique.RAYTRACED, scene.device)
+        bvh.trace_transmitted(scene, layer, facet, inside, settings.threads, None, settings.kernels, width)
+        return layer
+
+    def _repeat(self, layer: ReflectionLayer, numbers: wp.array, going: compact.Some, behind: tuple) -> None:
+        """The same where nothing is read, as often as rays go on: all stay where they are, and what ends has the number -1."""
+        device, n, limit = self._scene.device, layer.pixels.count, self._settings.transparency_depth
+        numbers, pixel = (wp.clone(array) for array in (numbers, layer.pixels.pixel))
+        facet, depth = wp.empty(n, dtype=int, device=device), wp.full(1, -1, dtype=int, device=device)
+        counted = launch.mark(device)
+        onward, ended = wp.zeros(n, dtype=wp.uint16, device=device), wp.zeros(n, dtype=wp.uint8, device=device)
+        point, normal, direction, inside, weight, fading, way = behind
+        rays = replace(layer.pixels, pixel=pixel, point=point, normal=normal, direction=direction, run=None, whole=None)
+
+        def still(triangle: wp.array) -> None:
+            launch.launch(next_surface_kernel, 1, [depth, going.mark], device)
+            inputs = [weight, triangle, depth, limit, pixel, numbers, facet, onward, ended, going.mark, counted]
+            launch.launch(still_kernel, n, inputs, device)
+
+        def behind_next() -> None:
+            layer = self._trace(rays, facet, inside)
+            seen = self._met(layer)
+            own, faded = self._lead(1, depth, layer, numbers, (weight, fading, way), behind)
+            self._gather(1, numbers, own, faded, seen)
+            still(layer.triangle)
+
+        still(layer.triangle)
+        launch.while_marked(going.mark, behind_next, limit)
+        for name, times in (("onward", onward), ("depth_limit", ended)):
+            self._first.count_later(name, partial(_repeated, times, counted))
+
+
+def _both(one: Callable[[], None], other: Callable[[], None]) -> None:
+    one()
+    other()
+
+
+def _repeated(times: wp.array, counted: wp.array) -> np.ndarray:
+    """The number of each ray as often as it is counted, if any was; read now."""
+    if not counted.numpy()[0]:
+        return np.zeros(0, np.int32)
+    return np.repeat(np.arange(len(times)), times.numpy())
 
 
 def add_to_picture(picture: wp.array, transmission: Transmission, radiance: wp.array, threads: int = 0) -> None:

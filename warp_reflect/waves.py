@@ -113,9 +113,11 @@ def wave_normals_kernel(
     normal: wp.array(dtype=wp.vec3),
     out_normals: wp.array(dtype=wp.vec3),
 ):
-    """One thread per pixel; finds what normal maps give in `out_normals`."""
+    """One thread per pixel, but for the number -1; finds what normal maps give in `out_normals`."""
     k = first + wp.tid()
     i = pixel[k]
+    if i < 0:
+        return
     corner = scene.triangles[triangle[i]]
     outward = facet_normal(scene.points[corner[0]], scene.points[corner[1]], scene.points[corner[2]])
     row = i // camera[0].width

@@ -16,7 +16,7 @@ import math
 import warp as wp
 
 from warp_reflect import compact, launch
-from warp_reflect.finishes.pyramid import Pyramid, empty_pyramid, halve, level_of, look_up_level, texel_of
+from warp_reflect.finishes.pyramid import Pyramid, empty_pyramid, halve, level_of, look_up_level, placed, texel_of
 from warp_reflect.layers import CameraView
 from warp_reflect.scene import Scene
 from warp_reflect.transmission import (
@@ -63,10 +63,13 @@ def divide_kernel(
     nearness: wp.array(dtype=float),
     radiance: wp.array(dtype=wp.vec3),
     spread_px: float,
-    out_pyramid: Pyramid,
+    pyramid: Pyramid,
 ):
-    """One thread per pixel: its share in the pictures of the octaves next to its own distance."""
+    """One thread per pixel, but for the number -1: its share in the pictures of the octaves next to its own distance."""
     i = first + wp.tid()
+    if pixel[i] < 0:
+        return
+    out_pyramid = placed(pyramid)
     texel = texel_of(out_pyramid, pixel[i], camera[0].width)
     depth = wp.length(point[i] - camera[0].eye)
     widest = radius_at(spread_px, depth, 0.0, camera[0], out_pyramid)
@@ -85,7 +88,7 @@ def divide_kernel(
 def frost_kernel(
     first: int,
     camera: wp.array(dtype=CameraView),
-    pyramid: Pyramid,
+    pictures: Pyramid,
     pixel: wp.array(dtype=int),
     point: wp.array(dtype=wp.vec3),
     radiance: wp.array(dtype=wp.vec3),
@@ -96,8 +99,13 @@ def frost_kernel(
     """One thread per pixel: the means of the octaves over their own discs, the nearest in front.
 
     The mean of a picture's coverage over the disc that is the cone's at that distance is the share of the cone that it covers.
+    Nothing where the pixel's number is -1.
     """
     i = first + wp.tid()
+    if pixel[i] < 0:
+        out_radiance[i] = wp.vec3(0.0, 0.0, 0.0)
+        return
+    pyramid = placed(pictures)
     row = pixel[i] // camera[0].width
     x = float(pixel[i] - row * camera[0].width - pyramid.x0) + 0.5
     y = float(row - pyramid.y0) + 0.5
@@ -132,9 +140,17 @@ def frost_kernel(
 
 
 @wp.kernel
-def mean_kernel(first: int, count: int, radiance: wp.array(dtype=wp.vec3), out_radiance: wp.array(dtype=wp.vec3)):
-    """One thread per pixel: adds one of `count` rays' share to the mean."""
+def mean_kernel(
+    first: int,
+    count: int,
+    pixel: wp.array(dtype=int),
+    radiance: wp.array(dtype=wp.vec3),
+    out_radiance: wp.array(dtype=wp.vec3),
+):
+    """One thread per pixel, but for the number -1: adds one of `count` rays' share to the mean."""
     i = first + wp.tid()
+    if pixel[i] < 0:
+        return
     out_radiance[i] += radiance[i] / float(count)
 
 
@@ -145,10 +161,13 @@ def missed_kernel(
     pixel: wp.array(dtype=int),
     blurry: wp.array(dtype=wp.vec3),
     rays: wp.array(dtype=wp.vec3),
-    out_pyramid: Pyramid,
+    pyramid: Pyramid,
 ):
-    """One thread per pixel: what its rays see beside the blurred picture."""
+    """One thread per pixel, but for the number -1: what its rays see beside the blurred picture."""
     i = first + wp.tid()
+    if pixel[i] < 0:
+        return
+    out_pyramid = placed(pyramid)
     missed = rays[i] - blurry[i]
     out_pyramid.color[texel_of(out_pyramid, pixel[i], camera[0].width)] = wp.vec4(missed[0], missed[1], missed[2], 1.0)
 
@@ -157,7 +176,7 @@ def missed_kernel(
 def correct_kernel(
     first: int,
     camera: wp.array(dtype=CameraView),
-    missed: Pyramid,
+    pictures: Pyramid,
     pixel: wp.array(dtype=int),
     blurry: wp.array(dtype=wp.vec3),
     radius: float,
@@ -166,8 +185,14 @@ def correct_kernel(
     brightest_ray: wp.array(dtype=wp.vec3),
     out_radiance: wp.array(dtype=wp.vec3),
 ):
-    """One thread per pixel: adds the mean of what is missed over a disc around it, between black and the brightest."""
+    """One thread per pixel, but for the number -1.
+
+    Adds the mean of what is missed over a disc around it, between black and the brightest.
+    """
     i = first + wp.tid()
+    if pixel[i] < 0:
+        return
+    missed = placed(pictures)
     row = pixel[i] // camera[0].width
     x = float(pixel[i] - row * camera[0].width - missed.x0) + 0.5
     y = float(row - missed.y0) + 0.5
@@ -203,7 +228,8 @@ def accumulated(scene: Scene, through: Through, found: Transmission, pane, sampl
     for k in range(samples):
         ray = look_through(scene, through.shown, through.interfaces, found.surface, pane.settings, (k, samples))
         seen = through_radiance(scene, through, ray, pane.settings)
-        launch.launch(mean_kernel, n, [samples, seen, total], scene.device, pane.settings.threads)
+        inputs = [samples, found.surface.pixel, seen, total]
+        launch.launch(mean_kernel, n, inputs, scene.device, pane.settings.threads)
     return total
 
 
@@ -213,7 +239,7 @@ def blurred(scene: Scene, through: Through, found: Transmission, radiance: wp.ar
     view = through.shown.gbuffer.view
     spread_px = pane.effects["frost"].numbers["radius_px"]
     levels = max(int(math.log2(max(spread_px, 1.0))) + 1, 1)
-    pyramid = empty_pyramid(pixels, device, int(OCTAVES), levels)
+    pyramid = empty_pyramid(pixels, device, int(OCTAVES), levels, through.shown.gbuffer.camera.size[0])
     inputs = [view, pixels.pixel, pixels.point, found.nearness, radiance, spread_px, pyramid]
     launch.launch(divide_kernel, pixels.count, inputs, device, threads)
     halve(pyramid, int(OCTAVES), device, threads)
@@ -228,7 +254,8 @@ def corrected(scene: Scene, through: Through, found: Transmission, blurry: wp.ar
     pixels, threads, device = found.layer.pixels, pane.settings.threads, scene.device
     view = through.shown.gbuffer.view
     radius = CORRECTED * pane.effects["frost"].numbers["radius_px"]
-    missed = empty_pyramid(pixels, device, 1, max(int(math.log2(max(radius, 1.0))) + 1, 1))
+    levels = max(int(math.log2(max(radius, 1.0))) + 1, 1)
+    missed = empty_pyramid(pixels, device, 1, levels, through.shown.gbuffer.camera.size[0])
     launch.launch(missed_kernel, pixels.count, [view, pixels.pixel, blurry, rays, missed], device, threads)
     halve(missed, 1, device, threads)
     # Nothing sends out more than there is to be seen.

@@ -5,10 +5,13 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from warp_reflect import launch
+from warp_reflect import compact, launch
 from warp_reflect.layers import MirrorPixels
+from warp_reflect.surface import run_box
 
 wp.set_module_options({"enable_backward": False})
+
+TOLD = 6  # numbers of `Pyramid.told`
 
 
 @wp.struct
@@ -19,6 +22,8 @@ class Pyramid:
         color: Radiance and coverage, multiplied by the latter; picture by picture, level by level.
         first: Texel at which each level starts.
         texels: Of one picture.
+        told: Where nothing is read the other numbers, in their order; those are for the most that there can be (`placed`).
+            Of length 0: they are these.
     """
 
     color: wp.array(dtype=wp.vec4)
@@ -29,6 +34,29 @@ class Pyramid:
     width: int
     height: int
     levels: int
+    told: wp.array(dtype=int)
+
+
+@wp.func
+def placed(pyramid: Pyramid) -> Pyramid:
+    """Pictures with their bounds, wherever these are."""
+    result = Pyramid()
+    result.color = pyramid.color
+    result.first = pyramid.first
+    result.texels = pyramid.texels
+    result.x0 = pyramid.x0
+    result.y0 = pyramid.y0
+    result.width = pyramid.width
+    result.height = pyramid.height
+    result.levels = pyramid.levels
+    if pyramid.told.shape[0] > 0:
+        result.texels = pyramid.told[0]
+        result.x0 = pyramid.told[1]
+        result.y0 = pyramid.told[2]
+        result.width = pyramid.told[3]
+        result.height = pyramid.told[4]
+        result.levels = pyramid.told[5]
+    return result
 
 
 @wp.func
@@ -72,11 +100,43 @@ def look_up_level(pyramid: Pyramid, picture: int, x: float, y: float, level: int
 
 
 @wp.kernel
-def halve_kernel(first: int, level: int, out_pyramid: Pyramid):
+def measure_kernel(
+    first: int,
+    run: wp.array(dtype=int),
+    image_width: int,
+    most: int,
+    # Outputs, see `Pyramid`:
+    out_told: wp.array(dtype=int),
+    out_first: wp.array(dtype=int),
+):
+    """One thread: as `empty_pyramid`, of pixels whose bounds are on the device; of so many levels at most."""
+    box = run_box(run, image_width)
+    i = first + wp.tid()
+    out_told[i + 1] = box[0]
+    out_told[i + 2] = box[1]
+    width = wp.max(box[2] - box[0], 0)
+    height = wp.max(box[3] - box[1], 0)
+    out_told[i + 3] = width
+    out_told[i + 4] = height
+    level = int(0)
+    texels = int(0)
+    while level < most and (wp.max(width, height) >> level) > 0:
+        out_first[level] = texels
+        texels += level_size(width, level) * level_size(height, level)
+        level += 1
+    out_told[i + 5] = level
+    out_told[i] = texels
+
+
+@wp.kernel
+def halve_kernel(first: int, level: int, pictures: int, pyramid: Pyramid):
     """One thread per texel of a level of all pictures: the mean of four of the level before."""
     i = first + wp.tid()
+    out_pyramid = placed(pyramid)
     width = level_size(out_pyramid.width, level)
     count = width * level_size(out_pyramid.height, level)
+    if level >= out_pyramid.levels or i >= pictures * count:
+        return
     start = (i // count) * out_pyramid.texels
     texel = i % count
     y = texel // width
@@ -92,7 +152,7 @@ def halve_kernel(first: int, level: int, out_pyramid: Pyramid):
     out_pyramid.color[start + out_pyramid.first[level] + texel] = color
 
 
-def empty_pyramid(pixels: MirrorPixels, device, pictures: int = 1, levels: int = 1) -> Pyramid:
+def empty_pyramid(pixels: MirrorPixels, device, pictures: int = 1, levels: int = 1, image_width: int = 0) -> Pyramid:
     """Room for pictures of a surface.
 
     Args:
@@ -100,6 +160,7 @@ def empty_pyramid(pixels: MirrorPixels, device, pictures: int = 1, levels: int =
         device: Where.
         pictures: Number of them.
         levels: At most so many; 1: no halves.
+        image_width: Of the frame. [pixels]
     """
     x0, y0, x1, y1 = pixels.box
     width, height = x1 - x0, y1 - y0
@@ -109,14 +170,21 @@ def empty_pyramid(pixels: MirrorPixels, device, pictures: int = 1, levels: int =
     sizes = [_level_texels(pyramid, level) for level in range(levels)]
     pyramid.texels = sum(sizes)
     pyramid.color = wp.zeros(pictures * pyramid.texels, dtype=wp.vec4, device=device)
-    pyramid.first = wp.array(np.cumsum([0, *sizes[:-1]]).astype(np.int32), dtype=int, device=device)
+    if pixels.run is None:
+        pyramid.first = wp.array(np.cumsum([0, *sizes[:-1]]).astype(np.int32), dtype=int, device=device)
+        pyramid.told = compact.none(int, device)
+    else:
+        pyramid.first, pyramid.told = (wp.empty(count, dtype=int, device=device) for count in (levels, TOLD))
+        inputs = [pixels.run, image_width, levels, pyramid.told, pyramid.first]
+        launch.launch(measure_kernel, 1, inputs, device)
     return pyramid
 
 
 def halve(pyramid: Pyramid, pictures: int, device, threads: int = 0) -> None:
     """Fill the levels above the first."""
     for level in range(1, pyramid.levels):
-        launch.launch(halve_kernel, pictures * _level_texels(pyramid, level), [level, pyramid], device, threads)
+        count = pictures * _level_texels(pyramid, level)
+        launch.launch(halve_kernel, count, [level, pictures, pyramid], device, threads)
 
 
 def _level_texels(pyramid: Pyramid, level: int) -> int:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import warp as wp
 
-from warp_reflect import launch, vector
+from warp_reflect import compact, launch, vector
 from warp_reflect.layers import MirrorPixels
+from warp_reflect.surface import run_box
 
 wp.set_module_options({"enable_backward": False})
 
@@ -21,6 +22,8 @@ class StillPicture:
         texels: Radiance and nearness: 1 / distance from the surface's plane, 0 for the sky, `NOT_SEEN` with radiance 0.
         x0, y0: The frame's pixel that is the first texel.
         width, height: Of the texels.
+        run, image_width: `MirrorPixels.run` where nothing is read, and the frame's width: the bounds are on the device
+            (`placed`). Of length 0: they are these.
     """
 
     texels: wp.array(dtype=wp.vec4)
@@ -28,6 +31,26 @@ class StillPicture:
     y0: int
     width: int
     height: int
+    run: wp.array(dtype=int)
+    image_width: int
+
+
+@wp.func
+def placed(picture: StillPicture) -> StillPicture:
+    """A picture with its bounds, wherever these are."""
+    result = StillPicture()
+    result.texels = picture.texels
+    result.x0 = picture.x0
+    result.y0 = picture.y0
+    result.width = picture.width
+    result.height = picture.height
+    if picture.run.shape[0] > 0:
+        box = run_box(picture.run, picture.image_width)
+        result.x0 = box[0] - 1
+        result.y0 = box[1] - 1
+        result.width = box[2] - box[0] + 2
+        result.height = box[3] - box[1] + 2
+    return result
 
 
 @wp.func
@@ -69,8 +92,11 @@ def fill_kernel(
     radiance: wp.array(dtype=wp.vec3),
     out_picture: StillPicture,
 ):
-    """One thread per pixel."""
+    """One thread per pixel, but for the number -1."""
     i = first + wp.tid()
+    if pixel[i] < 0:
+        return
+    picture = placed(out_picture)
     near = float(0.0)
     if nearness.shape[0] > 0:
         near = nearness[i]
@@ -78,7 +104,7 @@ def fill_kernel(
         near = 1.0 / distance[i]
     near /= wp.max(wp.abs(wp.dot(direction[i], normal[i])), LEAST_COSINE)
     row = pixel[i] // image_width
-    texel = (row - out_picture.y0) * out_picture.width + pixel[i] - row * image_width - out_picture.x0
+    texel = (row - picture.y0) * picture.width + pixel[i] - row * image_width - picture.x0
     out_picture.texels[texel] = wp.vec4(radiance[i][0], radiance[i][1], radiance[i][2], near)
 
 
@@ -105,10 +131,11 @@ def make_picture(
     device = radiance.device
     x0, y0, x1, y1 = pixels.box
     picture = StillPicture()
+    picture.run, picture.image_width = compact.none(int, device) if pixels.run is None else pixels.run, image_width
     picture.x0, picture.y0, picture.width, picture.height = x0 - 1, y0 - 1, x1 - x0 + 2, y1 - y0 + 2
     texels = wp.vec4(0.0, 0.0, 0.0, float(NOT_SEEN))
     picture.texels = wp.full(picture.width * picture.height, texels, dtype=wp.vec4, device=device)
-    none = wp.empty(0, dtype=float, device=device), wp.empty(0, dtype=int, device=device)
+    none = compact.none(float, device), compact.none(int, device)
     hits = hits or (none[1], none[0])
     inputs = [image_width, none[0] if nearness is None else nearness, *hits]
     inputs += [pixels.pixel, pixels.normal, pixels.direction, radiance, picture]

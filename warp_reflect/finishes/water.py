@@ -16,7 +16,7 @@ from __future__ import annotations
 import warp as wp
 
 from warp_reflect import bvh, launch, shade, vector
-from warp_reflect.finishes.still_picture import StillPicture, look_up, make_picture, nearness_at
+from warp_reflect.finishes.still_picture import StillPicture, look_up, make_picture, nearness_at, placed
 from warp_reflect.layers import CameraView, ReflectionLayer
 from warp_reflect.optics import refract
 from warp_reflect.scene import Scene
@@ -72,8 +72,11 @@ def reflect_waves_kernel(
     radiance: wp.array(dtype=wp.vec3),
     out_radiance: wp.array(dtype=wp.vec3),
 ):
-    """One thread per mirror pixel."""
+    """One thread per mirror pixel, but for the number -1."""
     i = first + wp.tid()
+    if pixel[i] < 0:
+        return
+    still = placed(picture)
     row = pixel[i] // camera[0].width
     own = wp.vec2(float(pixel[i] - row * camera[0].width) + 0.5, float(row) + 0.5)
     n = normal[i]
@@ -83,12 +86,12 @@ def reflect_waves_kernel(
     rise = wp.dot(turned, n)
     behind = turned - 2.0 * rise * n
     least = LEAST_NEARNESS / wp.max(wp.length(to_point), LEAST_DEPTH)
-    near = nearness_at(picture, own[0], own[1], 0.0)
+    near = nearness_at(still, own[0], own[1], 0.0)
     at = own
     for _step in range(MIRROR_STEPS):
         at = seen_at(camera[0], to_point + behind / wp.max(near * rise, least), own)
-        near = nearness_at(picture, at[0], at[1], near)
-    out_radiance[i] = shifted_radiance(picture, own, at, radiance[i])
+        near = nearness_at(still, at[0], at[1], near)
+    out_radiance[i] = shifted_radiance(still, own, at, radiance[i])
 
 
 @wp.func
@@ -129,7 +132,7 @@ def refract_waves_kernel(
     normals: wp.array(dtype=wp.vec3),
     inside: wp.array(dtype=wp.uint8),
     ior: float,
-    picture: StillPicture,
+    still_picture: StillPicture,
     # Pixels of the surface, with the normals on the far side:
     pixel: wp.array(dtype=int),
     point: wp.array(dtype=wp.vec3),
@@ -137,8 +140,11 @@ def refract_waves_kernel(
     radiance: wp.array(dtype=wp.vec3),
     out_radiance: wp.array(dtype=wp.vec3),
 ):
-    """One thread per pixel of the surface; an eye behind it has its turned rays already."""
+    """One thread per pixel of the surface, but for the number -1; an eye behind it has its turned rays already."""
     i = first + wp.tid()
+    if pixel[i] < 0:
+        return
+    picture = placed(still_picture)
     out_radiance[i] = radiance[i]
     n = -normal[i]
     row = pixel[i] // camera[0].width
