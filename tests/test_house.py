@@ -21,9 +21,9 @@ FILES = {
 
 # A module imports from its own floor or below. A new module belongs into this table; `x.*` is a folder.
 FLOORS = {
-    1: "settings launch compact counts vector direct_vector hits_vector packets wide_packets wide_tree devices optics "
-    "any_hit shapes bodies topology cubemap quadrics quadric_roots quadric_curve quadric_fit heightfield heightfield_vector "
-    "grid_rays occupancy voxels "
+    1: "settings launch compact counts vector direct_vector hits_vector packets wide_packets wide_tree ray_tree ray_query "
+    "devices optics any_hit shapes bodies topology cubemap quadrics quadric_roots quadric_curve quadric_fit heightfield "
+    "heightfield_vector grid_rays occupancy voxels "
     "images metrics timing clipping cutouts",
     2: "scene scene_times at_rest reflectors environment_maps baked_maps "
     "segments layers trees ray_walk bvh raster raster_pieces raster_vector raster_rays_vector shade shade_vector surface "

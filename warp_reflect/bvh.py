@@ -94,6 +94,7 @@ def is_on(
     return body_at(scene, facets, pixel, body, bodies, i).first_triangle == body.first_triangle
 
 
+@launch.most_registers(launch.RAY_REGISTERS)
 @wp.kernel
 def trace_pixels_kernel(
     first: int,
@@ -200,6 +201,7 @@ def own_obstacles_kernel(
     out_blocked[i] = wp.uint8(wp.where(hit.status == SKY, 0, 1))
 
 
+@launch.most_registers(launch.RAY_REGISTERS)
 @wp.kernel(module=ONWARD)
 def trace_onward_kernel(
     first: int,
@@ -272,7 +274,7 @@ class Tracer:
 
     @property
     def id(self) -> int:
-        return 0 if self._tree is None else self._tree.to(self._view.points).mesh.id
+        return 0 if self._tree is None else self._tree.to(self._view.points).id
 
     @property
     def packets(self) -> int:

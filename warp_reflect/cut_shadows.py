@@ -13,6 +13,7 @@ from warp_reflect.bvh import TRACE_SPLIT_MIN
 from warp_reflect.cutouts import is_hole
 from warp_reflect.direct import SPHERE, AreaView, DirectView, area_irradiance
 from warp_reflect.holes import HOLES_MAX
+from warp_reflect.ray_query import first_met, triangle_in
 from warp_reflect.ray_walk import flush_direction, ray_offset
 from warp_reflect.scene import SceneView
 from warp_reflect.shadow_starts import RayStart, ray_start, sample_place, sample_shift
@@ -29,13 +30,14 @@ def is_free_past_holes(mesh_id: wp.uint64, scene: SceneView, start: RayStart, di
     holes = int(0)
     while holes < HOLES_MAX and t0 < reach:
         holes += 1
-        query = wp.mesh_query_ray(mesh_id, start.p + t0 * d, d, reach - t0)
-        if not query.result:
+        met = first_met(mesh_id, start.p + t0 * d, d, reach - t0)
+        triangle = triangle_in(met)
+        if triangle < 0:
             return True
         # The traversal names its weights for the first and second corner.
-        if not is_hole(scene.cuts, query.face, query.v, 1.0 - query.u - query.v):
+        if not is_hole(scene.cuts, triangle, met[2], 1.0 - met[1] - met[2]):
             return False
-        t0 += query.t
+        t0 += met[0]
         t0 += ray_offset(start.p + t0 * d)
     return t0 >= reach
 

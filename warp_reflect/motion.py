@@ -14,6 +14,7 @@ import warp as wp
 
 from warp_reflect.launch import launch
 from warp_reflect.layers import Camera, CameraView, GBuffer, ReflectionLayer, eye_ray_direction, eye_ray_origin, project
+from warp_reflect.ray_query import first_met, triangle_in
 from warp_reflect.scene import Scene, SceneView
 from warp_reflect.shapes import intersect_triangle, unit
 from warp_reflect.surface import surface_at
@@ -42,11 +43,12 @@ def miss_angle(
     """How the ray reflected at pixel coordinate (x, y) passes a point: (offset / distance, 1), or 0 off the mirror."""
     direction = unit(eye_ray_direction(camera[0], x, y))
     origin = camera[0].eye + eye_ray_origin(camera[0], x, y)
-    query = wp.mesh_query_ray(mesh_id, origin, direction, FAR)
-    if not query.result:
+    met = first_met(mesh_id, origin, direction, FAR)
+    triangle = triangle_in(met)
+    if triangle < 0:
         return wp.vec4(0.0, 0.0, 0.0, 0.0)
-    key = 1.0 / wp.max(query.t * wp.dot(direction, camera[0].forward), 1.0e-30)
-    s = surface_at(scene, camera, first_triangle + query.face, key, x, y)
+    key = 1.0 / wp.max(met[0] * wp.dot(direction, camera[0].forward), 1.0e-30)
+    s = surface_at(scene, camera, first_triangle + triangle, key, x, y)
     d = s.incident - 2.0 * wp.dot(s.incident, s.normal) * s.normal
     to_target = target - s.p_scene
     along = wp.dot(to_target, d)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import warp as wp
 
+from warp_reflect.ray_query import first_met, triangle_in
 from warp_reflect.scene import SceneView
 from warp_reflect.settings import Status
 from warp_reflect.shapes import clamp_weights, facet_normal, intersect_triangle, max_abs
@@ -163,15 +164,13 @@ def exact_hit(
 
 @wp.func
 def ask(mesh_id: wp.uint64, origin: wp.vec3, direction: wp.vec3) -> Met:
-    """Warp's answer."""
+    """What the structure answers."""
     met = Met()
-    met.triangle = -1
-    query = wp.mesh_query_ray(mesh_id, origin, direction, FAR)
-    if query.result:
-        met.triangle = query.face
-        met.t = query.t
-        met.first = query.u
-        met.second = query.v
+    answer = first_met(mesh_id, origin, direction, FAR)
+    met.triangle = triangle_in(answer)
+    met.t = answer[0]
+    met.first = answer[1]
+    met.second = answer[2]
     return met
 
 

@@ -28,6 +28,7 @@ from warp_reflect.direct import (
     shown_area,
 )
 from warp_reflect.optics import tangent_basis
+from warp_reflect.ray_query import any_met
 from warp_reflect.ray_walk import flush_direction
 from warp_reflect.scene import Scene
 from warp_reflect.settings import Settings
@@ -95,7 +96,7 @@ def asked_shadows(scene: Scene, settings: Settings) -> Shadows | None:
 @wp.func
 def is_free(mesh_id: wp.uint64, start: RayStart, direction: wp.vec3, reach: float) -> bool:
     """Whether nothing is met on the way."""
-    return not wp.mesh_query_ray_anyhit(mesh_id, start.p, flush_direction(direction), reach)
+    return not any_met(mesh_id, start.p, flush_direction(direction), reach)
 
 
 @wp.func

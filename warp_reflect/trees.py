@@ -1,4 +1,7 @@
-"""Warp's structure over triangles, and the wide one of packets beside it: built once, fitted where points have moved."""
+"""Warp's structure over triangles, and what rays walk instead: packets on a CPU, single ones on CUDA.
+
+Built once, fitted where points have moved.
+"""
 
 from __future__ import annotations
 
@@ -8,14 +11,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
+from warp_reflect.ray_tree import RayTree
 from warp_reflect.scene import Scene
 
 if TYPE_CHECKING:
     from warp_reflect.wide_tree import WideTree
 
 
-# On CUDA: triangles of a leaf. Rays through trees of one took 0.77 to 0.84 of the time of Warp's usual four, mirrors' and
-# shadows', in three scenes on an H100; 0.70 to 0.78 through "sah", which the host builds a hundred times as long.
+# On CUDA: triangles of a leaf, of which `ray_tree.py` puts a few together. Down "sah", which the host builds 60 times as long,
+# rays take 0.86 to 0.93 of the time, mirrors' and shadows', in two scenes on an H100.
 CUDA_LEAF = 1
 
 
@@ -39,6 +43,21 @@ class Tree:
         self._wide: WideTree | None = None
         self._fitted: wp.array | None = points
         self._wide_fits = False
+        self._rays: RayTree | None = None
+
+    @property
+    def id(self) -> int:
+        """Handle for `ray_query.py`, of what it is fitted to."""
+        if not self.mesh.device.is_cuda:
+            return self.mesh.id
+        with self._making:
+            if self._rays is None:
+                self._rays = RayTree(self.mesh)
+                if not self._rays.is_whole:
+                    # Some branch is much longer than the others; where each is of half the triangles, none is.
+                    self.mesh = wp.Mesh(self.mesh.points, self.mesh.indices, bvh_constructor="median")
+                    self._rays = RayTree(self.mesh)
+            return self._rays.id
 
     def to(self, points: wp.array) -> Tree:
         """Fit it to points, if it is not."""
@@ -47,6 +66,8 @@ class Tree:
                 if self.mesh.points is not points:
                     wp.copy(self.mesh.points, points)
                 self.mesh.refit()
+                if self._rays is not None:
+                    self._rays.fit()
                 self._fitted, self._wide_fits = points, False
         return self
 
