@@ -55,7 +55,7 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
     const F eye_height = fmax(length(white_eye) - 1.0f, F(1.0e-3f));
     // What is left to search, side by side, and a vector more for the last load: of a run, then of all runs.
     constexpr int ROWS = 8, RUN = ROWS * LANES, TASK = BLOCKS * BLOCK, RUNS = TASK / RUN;
-    constexpr int FEW = 3, FEW_ROW = FEW * TASK / LANES + LANES;
+    constexpr int FEW = LANES / 2 - 1, FEW_ROW = FEW * TASK / LANES + LANES;
     enum { X = 3, BEST = 6, P = 9, N = 12, STEP = 15, RESIDUAL = 18, SHRINK = 19, KEPT = 20 };
     float at[X + 3][RUN + LANES], few[KEPT][FEW_ROW], far[X + 3][TASK + LANES];
     int vertex_of[RUN + LANES], few_vertex[FEW_ROW], few_used[FEW_ROW], far_vertex[TASK + LANES];
@@ -66,11 +66,12 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
         const float* row;
         V step;
         F shrink;
-        I asked, going, better, later, used;
-        // Of this evaluation and of the next, in turn. Of this one only the cell is where it was: the rest is of the best.
-        V x[2];
-        Sample s[2];
+        I going, better;
+        // Of this evaluation and of the next, in turn. Once it is judged, all but the cell is of the best so far. Not more of a
+        // sample than this: ROWS searches are to lie in the innermost cache.
+        V x[2], p[2], n[2];
         Cell cells[2];
+        V p_u, p_v, n_u, n_v;
         Law law;  // with the best's residual
         int last, turns;
     };
@@ -78,7 +79,7 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
     Search unasked;  // what is known before the first evaluation
     unasked.law.residual = F(1.0e30f);
     unasked.shrink = F(1.0f);
-    unasked.x[1] = unasked.s[1].p = unasked.s[1].n = unasked.step = same(0.0f);
+    unasked.x[1] = unasked.p[1] = unasked.n[1] = unasked.step = same(0.0f);
     // map_search.search_newton. A vector goes on while more than FEW of its lanes do: the others go on side by side after the
     // last run, and then those that ended far from a root start again from a coarse seed.
     for (int round = 0; round < RUNS + 2; ++round) {
@@ -209,45 +210,57 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
                 auto at_row = [&](int k) -> V {
                     return V{load(row + k * ROW), load(row + (k + 1) * ROW), load(row + (k + 2) * ROW)};
                 };
-                g.asked = g.going = start + lanes() < searched;
+                g.going = start + lanes() < searched;
                 g.row = row;
                 g.x[0] = at_row(X);
                 g.cells[0] = map_cell(g.x[0]);
-                g.later = g.used = I(0);
                 if (in_few) {
                     g.x[1] = at_row(BEST);
-                    g.s[1].p = at_row(P);
-                    g.s[1].n = at_row(N);
+                    g.p[1] = at_row(P);
+                    g.n[1] = at_row(N);
                     g.step = at_row(STEP);
                     g.law.residual = load(row + RESIDUAL * ROW);
                     g.shrink = load(row + SHRINK * ROW);
-                    g.used = iload(few_used + start);
                 }
                 open[k] = k;
             }
+            auto used_before = [&](int k) -> I { return in_few ? iload(few_used + from + k * LANES) : I(0); };
             auto target_of = [&](const Search& g) -> V { return V{load(g.row), load(g.row + ROW), load(g.row + 2 * ROW)}; };
             for (int turns = 1; opened > 0; ++turns) {
                 const int now = (turns - 1) & 1, next = turns & 1;
                 // Of all vectors the samples, then how good they are, then the steps, then, of those near a root, their ends.
                 int on = 0, near_root[ROWS], near_count = 0;
-                for (int k = 0; k < opened; ++k) group[open[k]].s[now] = sample_cell(group[open[k]].cells[now]);
+                auto sample_of = [&](const Search& g) -> Sample {
+                    return Sample{g.p[now], g.p_u, g.p_v, g.n[now], g.n_u, g.n_v};
+                };
+                for (int k = 0; k < opened; ++k) {
+                    Search& g = group[open[k]];
+                    const Sample s = sample_cell(g.cells[now]);
+                    KEEP_APART(g)
+                    g.p[now] = s.p;
+                    g.n[now] = s.n;
+                    g.p_u = s.p_u;
+                    g.p_v = s.p_v;
+                    g.n_u = s.n_u;
+                    g.n_v = s.n_v;
+                }
                 for (int k = 0; k < opened; ++k) {
                     Search& g = group[open[k]];
                     const Search& known = begun ? g : unasked;
-                    Law law = measure(g.s[now], target_of(g));
+                    Law law = measure(sample_of(g), target_of(g));
                     const I better = g.going & (law.residual < known.law.residual);
                     const F residual = pick(better, law.residual, known.law.residual);
                     const F shrink = pick(better, F(1.0f), known.shrink * retry_shrink);
                     const F least = pick(residual <= accepted, F(shrink_near), F(shrink_min));
                     const I unended = ~(residual <= settings.tolerance) & (shrink >= least);
-                    const I going = g.going & unended & (g.used + turns < settings.iterations);
+                    const I going = g.going & unended & (used_before(open[k]) + turns < settings.iterations);
                     if (bits(better) != bits(I(-1))) {
                         const V x = vpick(better, g.x[now], known.x[next]);
-                        const V p = vpick(better, g.s[now].p, known.s[next].p), n = vpick(better, g.s[now].n, known.s[next].n);
+                        const V p = vpick(better, g.p[now], known.p[next]), n = vpick(better, g.n[now], known.n[next]);
                         KEEP_APART(g)
                         g.x[now] = x;
-                        g.s[now].p = p;
-                        g.s[now].n = n;
+                        g.p[now] = p;
+                        g.n[now] = n;
                     }
                     law.residual = residual;
                     KEEP_APART(g)
@@ -265,13 +278,13 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
                 opened = on;
                 for (int k = 0; k < opened; ++k) {
                     Search& g = group[open[k]];
-                    const V step = vpick(g.better, newton_step(g.s[now], g.law, target_of(g)), (begun ? g : unasked).step);
+                    const V step = vpick(g.better, newton_step(sample_of(g), g.law, target_of(g)), (begun ? g : unasked).step);
                     KEEP_APART(g)
                     g.step = step;
                 }
                 for (int k = 0; k < opened; ++k) {
                     Search& g = group[open[k]];
-                    const V x = vpick(g.going, step_on_cube(g.x[now], g.s[now].p, g.step, g.shrink), g.x[now]);
+                    const V x = vpick(g.going, step_on_cube(g.x[now], g.p[now], g.step, g.shrink), g.x[now]);
                     KEEP_APART(g)
                     g.x[next] = x;
                     g.cells[next] = map_cell(x);
@@ -281,44 +294,42 @@ BLOCKS = 8  # of a task: few of their searches take long, and those fill vectors
                     Search& g = group[near_root[k]];
                     const Cell from = g.cells[now], to = g.cells[next];
                     const F along_u = to.a - from.a, along_v = to.b - from.b;
-                    const Sample end = slide(g.s[now], along_u, along_v);
+                    const Sample end = slide(sample_of(g), along_u, along_v);
                     const F there = measure(end, target_of(g)).residual, residual_here = g.law.residual;
                     const I near = g.going & g.better & (residual_here * residual_here <= settings.tolerance);
                     const I ended = near & (to.texel == from.texel) & (magnitude(along_u * along_v) <= twist_max)
                         & (there <= settings.tolerance);
                     const V x = vpick(ended, g.x[next], g.x[now]);
-                    const V p = vpick(ended, end.p, g.s[now].p), n = vpick(ended, end.n, g.s[now].n);
+                    const V p = vpick(ended, end.p, g.p[now]), n = vpick(ended, end.n, g.n[now]);
                     const F residual = pick(ended, there, residual_here);
                     KEEP_APART(g)
                     g.x[now] = x;
-                    g.s[now].p = p;
-                    g.s[now].n = n;
+                    g.p[now] = p;
+                    g.n[now] = n;
                     g.law.residual = residual;
                     g.going &= ~ended;
                 }
                 on = 0;
                 for (int k = 0; k < opened; ++k) {
                     Search& g = group[open[k]];
-                    const int left = __builtin_popcount(bits(g.going)), few_left = round < RUNS ? FEW : 0;
-                    g.later = left <= few_left ? g.going : I(0);
                     open[on] = open[k];
-                    on += left > few_left;
+                    on += __builtin_popcount(bits(g.going)) > (round < RUNS ? FEW : 0);
                 }
                 opened = on;
             }
             for (int k = 0; k < vectors; ++k) {
                 const Search& g = group[k];
                 const int start = from + k * LANES;
-                const V target = target_of(g), best = g.x[g.last], p = g.s[g.last].p, n = g.s[g.last].n;
+                const V target = target_of(g), best = g.x[g.last], p = g.p[g.last], n = g.n[g.last];
                 const F residual = g.law.residual;
-                const I asked = g.asked, later = g.later, vertex = iload(numbers + start);
+                const I asked = start + lanes() < searched, later = g.going, vertex = iload(numbers + start);
                 if (bits(later)) {
                     const V x = g.x[g.last ^ 1];
                     const F each[KEPT] = {target.x, target.y, target.z, x.x, x.y, x.z, best.x, best.y, best.z,
                         p.x, p.y, p.z, n.x, n.y, n.z, g.step.x, g.step.y, g.step.z, residual, g.shrink};
                     const unsigned marked = bits(later);
                     for (int k = 0; k < KEPT; ++k) packed((int*)few[k] + few_count, __builtin_bit_cast(I, each[k]), marked);
-                    packed(few_used + few_count, g.used + g.turns, marked);
+                    packed(few_used + few_count, used_before(k) + g.turns, marked);
                     few_count += packed(few_vertex + few_count, vertex, marked);
                 }
                 I done = asked & ~later & (residual <= accepted), answer = I(converged);
