@@ -84,6 +84,7 @@ def reflect_hits_kernel(
     """One thread per asked ray: its reflection at the mirror that it met, and what the domes gave there; weight 0: too dark."""
     k = first + wp.tid()
     i = index[k]
+    out_weight[k] = wp.vec3(0.0, 0.0, 0.0)
     if i < 0:
         return
     tri = triangle[i]
@@ -303,11 +304,9 @@ def _reflections(
 ) -> list[wp.array]:
     """Points, normals and directions of rays that mirrors reflect, what they carry, and what the domes gave there."""
     looks, normals = prepare_looks(scene, gbuffer, layer, threads), prepare_normals(scene, gbuffer, layer, threads)
-    point, normal, direction, domes = (wp.empty(len(asked), dtype=wp.vec3, device=scene.device) for _ in range(4))
-    carried = wp.zeros(len(asked), dtype=wp.vec3, device=scene.device)  # of what is too dark nothing is written
+    outputs = [wp.empty(len(asked), dtype=wp.vec3, device=scene.device) for _ in range(5)]
     inputs = [scene.view, scene.lights, looks, normals, layer.triangle, layer.u, layer.v]
     inputs += [layer.pixels.direction, weight, asked]
-    outputs = [point, normal, direction, carried, domes]
     where = scene.device, threads
     launch.launch(reflect_hits_kernel, len(asked), [*inputs, *outputs], *where, split_min=bvh.TRACE_SPLIT_MIN)
     return outputs

@@ -112,6 +112,7 @@ def trace_pixels_kernel(
     indexed: int,
     known: int,
     twice: int,
+    blank: int,
     status: wp.array(dtype=wp.uint8),
     # Outputs:
     out_triangle: wp.array(dtype=int),
@@ -120,8 +121,9 @@ def trace_pixels_kernel(
     out_distance: wp.array(dtype=float),
     out_status: wp.array(dtype=wp.uint8),
 ):
-    """One thread per asked mirror pixel, of which nothing is written where its number is -1; or per ray, without pixels.
+    """One thread per asked mirror pixel, or per ray, without pixels.
 
+    Where a pixel's number is -1 nothing is met, or if not `blank` nothing is written: the entry may be another mirror's.
     A ray's facet is `facets`' own; one without a facet meets nothing. `bodies` are those of patches; of length 0: `body` is all
     pixels' own. `known` is 1 for what `bvh_vector.first_met` has left. Rays that meet nothing are turned and asked `twice`. With
     a `status` a miss beside a hit, or without a neighbour, is asked again. Kernels of their own would each be compiled for as
@@ -134,19 +136,21 @@ def trace_pixels_kernel(
         if i < 0:
             return
     facet = int(-1)
-    if pixel.shape[0] > 0:
-        if pixel[i] < 0:
-            return
-        facet = facets[pixel[i]]
-    else:
+    there = bool(False)
+    if pixel.shape[0] == 0:
         facet = facets[i]
-        if facet < 0:
+        there = facet >= 0
+    elif pixel[i] >= 0:
+        facet = facets[pixel[i]]
+        there = bool(True)
+    if not there:
+        if blank != 0:
             out_triangle[i] = -1
             out_u[i] = 0.0
             out_v[i] = 0.0
             out_distance[i] = 0.0
             out_status[i] = wp.uint8(NONE)
-            return
+        return
     retry = status.shape[0]
     ray = direction[i]
     own = body
@@ -402,9 +406,13 @@ def trace_together(
     """
     whole, tracer = layers[0].whole, scene.mirror_tracer(mirrors[0][0])
     if any(scene.mirror_tracer(part) is not tracer for part, _ in mirrors):
-        # They may not show the same things.
+        # They may not show the same things. Where nothing is read each has an entry for every pixel, those of the whole.
+        first = True
         for layer, (part, convex) in zip(layers, mirrors, strict=True):
-            trace_pixels(scene, gbuffer, layer.pixels, layer, part, convex, None, threads, kernels)
+            leaving, tracer = [(0, body_of(scene, part, convex))], scene.mirror_tracer(part)
+            none = compact.none(OwnBody, scene.device)
+            _trace(scene, gbuffer, tracer, layer.pixels, layer, leaving, none, None, threads, kernels, first)
+            first = False
         return
     firsts = accumulate((layer.pixels.count for layer in layers[:-1]), initial=0)
     leaving = [(first, body_of(scene, *mirror)) for first, mirror in zip(firsts, mirrors, strict=True)]
@@ -422,8 +430,12 @@ def _trace(
     index: wp.array | None,
     threads: int,
     kernels: str,
+    blank: bool = True,
 ) -> int:
-    """What `trace_pixels` does, of pixels body after body, from such a ray on; `bodies` of length 0: there is one."""
+    """What `trace_pixels` does, of pixels body after body, from such a ray on; `bodies` of length 0: there is one.
+
+    Not `blank`: entries without a pixel are left as they are.
+    """
     count = pixels.count if index is None else len(index)
     if count == 0:
         return 0
@@ -445,12 +457,12 @@ def _trace(
     known, left, missed = _first_met(scene, tracer, layer, start, leaving, index, False, threads, kernels, width)
     if left:
         some = _with_status(layer, index, Status.NONE) if known else asked
-        inputs = [*rays, *some, known, 0, compact.none(wp.uint8, scene.device), *outputs]
+        inputs = [*rays, *some, known, 0, int(blank), compact.none(wp.uint8, scene.device), *outputs]
         launch.launch(trace_pixels_kernel, len(some[0]), inputs, scene.device, threads, split_min=TRACE_SPLIT_MIN)
     if left or missed:
         some = _with_status(layer, index, Status.SKY) if known else asked
         # The neighbours' answers are read from a copy, so that the order of threads cannot matter.
-        inputs = [*rays, *some, 0, 0, wp.clone(layer.status), *outputs]
+        inputs = [*rays, *some, 0, 0, 0, wp.clone(layer.status), *outputs]
         launch.launch(trace_pixels_kernel, len(some[0]), inputs, scene.device, threads, split_min=TRACE_SPLIT_MIN)
     if scene.has_hole is not None:
         own = {"body": leaving[0][1]} if not len(bodies) else {"bodies": bodies}
@@ -590,7 +602,7 @@ def trace_bounced(
         some = _with_status(layer, None, Status.NONE) if known else [facet, 0]
         count = len(some[0]) if known else pixels.count
         inputs = [wp.uint64(scene.tracer.id), scene.view, *start[:2], pixels.point, pixels.normal, pixels.direction]
-        inputs += [OwnBody(), bodies, *some, known, 1, compact.none(wp.uint8, scene.device)]
+        inputs += [OwnBody(), bodies, *some, known, 1, 1, compact.none(wp.uint8, scene.device)]
         inputs += [layer.triangle, layer.u, layer.v, layer.distance, layer.status]
         launch.launch(trace_pixels_kernel, count, inputs, scene.device, threads, split_min=TRACE_SPLIT_MIN)
     if scene.has_hole is not None:

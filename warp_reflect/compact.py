@@ -52,13 +52,13 @@ def list_kernel(
         out_list[end[i] - 1] = i
 
 
-def _listed(marks: wp.array, value: int) -> tuple[wp.array, wp.array]:
-    """(numbers of the marked elements, -1 behind them, as many as there are elements; how many up to each)."""
+def _listed(marks: wp.array, value: int, padded: bool) -> tuple[wp.array, wp.array]:
+    """(numbers of the marked elements, as many as there are elements, those behind -1 if padded; how many up to each)."""
     count, device = len(marks), marks.device
     ones, ends = (wp.empty(count, dtype=int, device=device) for _ in range(2))
     launch(is_marked_kernel, count, [marks, value, ones], device)
     wp.utils.array_scan(ones, ends, inclusive=True)
-    numbers = wp.full(count, -1, dtype=int, device=device)
+    numbers = wp.full(count, -1, dtype=int, device=device) if padded else wp.empty(count, dtype=int, device=device)
     launch(list_kernel, count, [marks, value, ends, numbers], device)
     return numbers, ends
 
@@ -71,7 +71,7 @@ def marked(marks: wp.array, value: int) -> wp.array:
         return wp.empty(0, dtype=int, device=marks.device)
     if not reads():
         raise RuntimeError("marked: a list's length is asked for where nothing is read; expected padded")
-    numbers, ends = _listed(marks, value)
+    numbers, ends = _listed(marks, value, False)
     return numbers[: int(ends[len(ends) - 1 :].numpy()[0])]
 
 
@@ -84,7 +84,7 @@ def padded(marks: wp.array, value: int) -> tuple[wp.array, wp.array]:
     if not stays(marks.device) or not len(marks):
         numbers = marked(marks, value)
         return numbers, wp.full(1, len(numbers), dtype=int, device=marks.device)
-    numbers, ends = _listed(marks, value)
+    numbers, ends = _listed(marks, value, True)
     return numbers, ends[len(ends) - 1 :]
 
 

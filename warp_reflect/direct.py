@@ -253,10 +253,13 @@ def eye_weights_kernel(
     out_u: wp.array(dtype=float),
     out_v: wp.array(dtype=float),
 ):
-    """One thread per pixel (an empty `pixel`: of all of them): its ray, and the weights of the point it meets."""
+    """One thread per pixel (an empty `pixel`: of all of them): its ray, and the weights of the point it meets; else all 0."""
     i = first + wp.tid()
     tri = triangle[i]
     if tri < 0:
+        out_direction[i] = wp.vec3(0.0, 0.0, 0.0)
+        out_u[i] = 0.0
+        out_v[i] = 0.0
         return
     p = i
     if pixel.shape[0] > 0:
@@ -295,6 +298,7 @@ def direct_kernel(
     i = first + wp.tid()
     tri = triangle[i]
     if tri < 0:
+        out_irradiance[i] = wp.vec3(0.0, 0.0, 0.0)
         return
     corner = scene.triangles[tri]
     w = 1.0 - u[i] - v[i]
@@ -334,8 +338,8 @@ def points_of(
         none = compact.none(float, device)
         direction = compact.none(wp.vec3, device)
         return Points(triangle, none, none, direction, pixel, *size, gbuffer.view)
-    direction = wp.zeros(len(triangle), dtype=wp.vec3, device=device)
-    u, v = (wp.zeros(len(triangle), dtype=float, device=device) for _ in range(2))
+    direction = wp.empty(len(triangle), dtype=wp.vec3, device=device)
+    u, v = (wp.empty(len(triangle), dtype=float, device=device) for _ in range(2))
     inputs = [scene.view, gbuffer.view, triangle, pixel, direction, u, v]
     launch.launch(eye_weights_kernel, len(triangle), inputs, device, threads)
     return Points(triangle, u, v, direction, pixel, *size)
@@ -357,7 +361,7 @@ def direct_irradiance(
         vec3 [points], 0 where nothing is seen.
     """
     device = scene.device
-    result = wp.zeros(len(points.triangle), dtype=wp.vec3, device=device)
+    result = wp.empty(len(points.triangle), dtype=wp.vec3, device=device)
     if normals is None:
         normals = compact.none(wp.vec3, device)
     inputs = [scene.view, lights, points.triangle, points.u, points.v, points.direction, normals, result]

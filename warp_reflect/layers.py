@@ -120,28 +120,31 @@ class Camera:
 
         It lies on the device: what is launched again sees whichever camera lies there then.
         """
-        x = self.fx * self.right
-        y = -self.fy * self.up
-        view = CameraView()
-        view.eye = wp.vec3(*(self.eye - scene.origin))
-        view.forward = wp.vec3(*self.forward)
+        x, y = self.fx * self.right, -self.fy * self.up
+        # Word by word, in the order of `CameraView`: structures are copied to a device in four times as long.
+        words = np.zeros(CAMERA_WORDS, np.float32)
+        words[0:3], words[3:6] = self.eye - scene.origin, self.forward
+        corner = self.cy / self.fy * self.up
         if self.orthographic:
-            view.x_row = wp.vec4(*x, self.cx)
-            view.y_row = wp.vec4(*y, self.cy)
-            view.w_row = wp.vec4(0.0, 0.0, 0.0, 1.0)
-            view.ray_corner = wp.vec3(*(-self.cx / self.fx * self.right + self.cy / self.fy * self.up))
+            words[6:9], words[9], words[10:13], words[13], words[17] = x, self.cx, y, self.cy, 1.0
+            corner = -self.cx / self.fx * self.right + corner
         else:
-            view.x_row = wp.vec4(*(x + self.cx * self.forward), 0.0)
-            view.y_row = wp.vec4(*(y + self.cy * self.forward), 0.0)
-            view.w_row = wp.vec4(*self.forward, 0.0)
-            view.ray_corner = wp.vec3(*(self.forward - self.cx / self.fx * self.right + self.cy / self.fy * self.up))
-        view.ray_dx = wp.vec3(*(self.right / self.fx))
-        view.ray_dy = wp.vec3(*(-self.up / self.fy))
-        view.orthographic = int(self.orthographic)
-        view.near = self.near
-        view.far = self.far
-        view.width, view.height = self.size
-        return wp.array([view], dtype=CameraView, device=scene.device)
+            words[6:9], words[10:13], words[14:17] = (
+                x + self.cx * self.forward,
+                y + self.cy * self.forward,
+                self.forward,
+            )
+            corner = self.forward - self.cx / self.fx * self.right + corner
+        words[18:21], words[21:24], words[24:27] = corner, self.right / self.fx, -self.up / self.fy
+        words[28:30] = self.near, self.far
+        words.view(np.int32)[[27, 30, 31]] = self.orthographic, *self.size
+        held = wp.array(words, dtype=float, device=scene.device)
+        view = wp.array(ptr=held.ptr, dtype=CameraView, shape=1, capacity=held.capacity, device=scene.device)
+        view.held = held
+        return view
+
+
+CAMERA_WORDS = 32
 
 
 @wp.func
@@ -392,9 +395,7 @@ class ReflectionLayer:
 
     @classmethod
     def unset(cls, pixels: MirrorPixels, method: int, device) -> ReflectionLayer:
-        """For who answers every pixel: nothing is filled in, but where not every entry has one."""
-        if pixels.run is not None:
-            return cls.empty(pixels, method, device)
+        """For who answers every pixel: nothing is filled in."""
         kinds = {"triangle": int, "u": float, "v": float, "distance": float, "status": wp.uint8}
         room = {name: wp.empty(pixels.count, dtype=kind, device=device) for name, kind in kinds.items()}
         return cls(pixels=pixels, method=int(method), **room)

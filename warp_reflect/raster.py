@@ -649,7 +649,7 @@ def make_target(
     view.key = key
     view.x0, view.y0, view.x1, view.y1 = box
     view.column_first, view.column_end = x0, x1
-    view.mask = mask if mask is not None else wp.zeros(1, dtype=int, device=device)
+    view.mask = mask if mask is not None else none(int, device)
     view.mask_value = mask_value
     view.mask_width = camera.size[0]
     view.key_min = 0.0 if camera.orthographic else 1.0 / camera.far

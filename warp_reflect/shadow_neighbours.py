@@ -14,8 +14,9 @@ from __future__ import annotations
 
 import warp as wp
 
+from warp_reflect import compact
 from warp_reflect.direct import Points
-from warp_reflect.launch import launch
+from warp_reflect.launch import launch, reads
 from warp_reflect.shadow_starts import Starts, row_vector
 
 wp.set_module_options({"enable_backward": False})
@@ -160,9 +161,14 @@ def neighbours_of(points: Points, area_count: int, shared: bool, threads: int = 
     device = points.triangle.device
     around = Neighbours()
     around.width, around.pixel = points.width, points.pixel
-    around.index = wp.zeros(0, dtype=int, device=device)
+    around.index = compact.none(int, device)
     if area_count and len(points.pixel):
-        around.index = wp.full(points.width * points.height, -1, dtype=int, device=device)
+        size = points.width * points.height
+        # Plain kernels do not ask which pixels show no point: they find nothing there.
+        plain = wp.get_device(device).is_cuda or not reads()
+        around.index = (
+            wp.empty(size, dtype=int, device=device) if plain else wp.full(size, -1, dtype=int, device=device)
+        )
         launch(image_index_kernel, len(points.pixel), [points.pixel, around.index], device, threads)
     size = (points.width + 2 * NEIGHBOURS) * (points.height + 2 * NEIGHBOURS) + MARGIN
     around.found = wp.zeros((area_count, size), dtype=wp.uint8, device=device)
