@@ -59,6 +59,8 @@ def test_costs_of_another_machine_or_version_are_not_taken(kept, device, other, 
         lambda entry: entry.update(trace=True),
         lambda entry: entry.update(trace=-1.0),
         lambda entry: entry.update(trace=1e9),
+        lambda entry: entry.update(trace=10**400),
+        lambda entry: entry.update(trace=float("nan")),
     ],
 )
 def test_damaged_costs_are_not_believed(damage, kept, device, other):
@@ -71,7 +73,7 @@ def test_damaged_costs_are_not_believed(damage, kept, device, other):
     assert calibration.known(device) == calibration.built_in(device)
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", '{"x": 1}', "\x00\xff"])
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"x": 1}', "\x00\xff", "[" * 10**5])
 def test_files_that_are_none_are_no_calibration_and_are_replaced(text, kept, device, other):
     kept.parent.mkdir()
     kept.write_text(text)
@@ -87,6 +89,19 @@ def test_the_file_lies_in_the_users_cache(monkeypatch, tmp_path):
     assert calibration.cache_file() == tmp_path / "warp_reflect" / calibration.FILE_NAME
     monkeypatch.setenv(calibration.FILE_VARIABLE, "")
     assert calibration.cache_file() is None
+
+
+def test_a_user_without_a_home_has_the_built_in_costs(monkeypatch, device, capsys):
+    def nowhere():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(calibration.Path, "home", nowhere)
+    for name in (calibration.FILE_VARIABLE, "XDG_CACHE_HOME", "LOCALAPPDATA"):
+        monkeypatch.delenv(name, raising=False)
+    assert calibration.known(device) == calibration.built_in(device)
+    assert cli.main(["calibrate"]) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert line.startswith("error:") and "no home" in line
 
 
 def test_measured_costs_are_of_every_step_and_the_command_keeps_them(kept, device, monkeypatch, capsys):

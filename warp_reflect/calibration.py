@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import math
 import os
 import sys
 import tempfile
@@ -26,16 +25,19 @@ FACTORS = (1.0e-3, 1.0e3)
 
 
 def cache_file() -> Path | None:
-    """Where calibrations are kept; None: nowhere (`FILE_VARIABLE` is empty)."""
+    """Where calibrations are kept; None: nowhere (`FILE_VARIABLE` is empty, or its user has no home)."""
     named = os.environ.get(FILE_VARIABLE)
     if named is not None:
         return Path(named) if named else None
-    if sys.platform == "win32":
-        home = Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
-    elif sys.platform == "darwin":
-        home = Path.home() / "Library" / "Caches"
-    else:
-        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    try:
+        if sys.platform == "win32":
+            home = Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
+        elif sys.platform == "darwin":
+            home = Path.home() / "Library" / "Caches"
+        else:
+            home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    except RuntimeError:  # a container's user, who is no one
+        return None
     return home / "warp_reflect" / FILE_NAME
 
 
@@ -72,12 +74,13 @@ def check_writable() -> Path:
     """The file to keep calibrations in, once its folder is there.
 
     Raises:
-        ValueError: there is no place to keep them (`FILE_VARIABLE` is empty).
+        ValueError: there is no place to keep them (`cache_file`).
         OSError: the folder cannot be made or written to.
     """
     file = cache_file()
     if file is None:
-        raise ValueError(f"{FILE_VARIABLE} is empty: there is no file to keep a calibration in; unset it or name one")
+        why = "is empty" if FILE_VARIABLE in os.environ else "is not set, and the user has no home"
+        raise ValueError(f"{FILE_VARIABLE} {why}: there is no file to keep a calibration in; name one there")
     file.parent.mkdir(parents=True, exist_ok=True)
     if file.is_dir() or not os.access(file.parent, os.W_OK):
         raise OSError(f"{file}: cannot be written; name another file in {FILE_VARIABLE}")
@@ -127,7 +130,7 @@ def _entries(file: Path) -> dict:
     """What a file holds; nothing where it is not there or damaged."""
     try:
         entries = json.loads(file.read_text())
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return {}
     return entries if isinstance(entries, dict) else {}
 
@@ -143,5 +146,5 @@ def _read(file: Path, changed: int, key: str, usual: Costs) -> Costs | None:
 
 
 def _is_likely(value: object, usual: float) -> bool:
-    number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
     return number and FACTORS[0] * usual <= value <= FACTORS[1] * usual
