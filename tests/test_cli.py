@@ -550,6 +550,29 @@ def test_read_only_cache_lends_its_kernels(cached_module, monkeypatch):
     assert [path.name for path in copy.iterdir()] == [cached_module.name]
 
 
+@pytest.mark.parametrize("writable", [True, False])
+def test_modules_of_another_user_are_passed_by(writable, cached_module, monkeypatch):
+    """They can be neither read nor deleted; the others of the cache are lent."""
+    theirs = cached_module.parent / "wp_warp_reflect.theirs_0000000"
+    shutil.copytree(cached_module, theirs)
+    read, copy, delete = devices._is_whole, shutil.copytree, shutil.rmtree
+
+    def copied(source, to, **how):
+        copy(source, to, **how)
+        if Path(source) == theirs:
+            raise shutil.Error([(source, to, "Permission denied")])
+
+    monkeypatch.setattr(devices, "_is_whole", lambda folder: folder != theirs and read(folder))
+    monkeypatch.setattr(shutil, "copytree", copied)
+    monkeypatch.setattr(shutil, "rmtree", lambda folder, **how: folder == theirs or delete(folder, **how))
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(cached_module.parent))
+    monkeypatch.setattr(devices, "_is_writable", lambda folder: writable)
+    devices.open_device("cpu")
+    lent = Path(wp.config.kernel_cache_dir)
+    assert lent != cached_module.parent and theirs.is_dir()
+    assert [path.name for path in lent.iterdir()] == [cached_module.name]
+
+
 def test_warmup_readies_what_the_plan_needs_and_nothing_else(stage, capsys):
     assert cli.main(["warmup", str(stage), "--res", "64x36"]) == 0
     first = capsys.readouterr().out.splitlines()

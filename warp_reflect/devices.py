@@ -45,9 +45,10 @@ def open_device(name: str) -> str:
             wp.config.kernel_cache_dir = _temporary_cache()
             wp.init()
     cache = Path(wp.config.kernel_cache_dir)
-    if not _is_writable(cache):
+    # Of a cache that users share, some modules may be another one's alone: they can neither be read nor replaced.
+    if not _is_writable(cache) or any(folder.exists() for folder in heal_kernel_cache(cache)):
         wp.config.kernel_cache_dir = _temporary_cache(cache)
-    heal_kernel_cache(Path(wp.config.kernel_cache_dir))
+        heal_kernel_cache(Path(wp.config.kernel_cache_dir))
     keep_freed_memory()
     known = [device.alias for device in wp.get_devices()]
     if name not in known and name != "cuda":
@@ -101,12 +102,15 @@ def _is_writable(folder: Path) -> bool:
 
 
 def _temporary_cache(source: Path | None = None) -> str:
-    """A kernel cache for this process alone, with the compiled kernels of a cache that can only be read."""
+    """A kernel cache for this process alone, with those compiled kernels of another cache that can be read."""
     folder = Path(tempfile.mkdtemp(prefix="warp_reflect_kernels_"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     if source is not None and source.is_dir():
         for module in source.glob("wp_warp_reflect*"):
-            shutil.copytree(module, folder / module.name, dirs_exist_ok=True)
+            try:
+                shutil.copytree(module, folder / module.name)
+            except OSError:  # another user's
+                shutil.rmtree(folder / module.name, ignore_errors=True)
     return str(folder)
 
 
@@ -126,7 +130,7 @@ def heal_kernel_cache(cache: Path) -> list[Path]:
     A full disk or a crash leaves such files, and Warp would fail on them at every start.
 
     Returns:
-        The folders deleted.
+        The folders that were to be deleted: another user's stay.
     """
     damaged = [
         folder
