@@ -499,6 +499,23 @@ def run_parallel(jobs: list[Callable[[], None]]) -> None:
         raise failures[0]
 
 
+class Turns:
+    """A lock that threads of one process wait for: one that was forked has none of its parent's, which may have held it."""
+
+    def __init__(self):
+        self._locks: dict[int, threading.RLock] = {}
+
+    def __enter__(self) -> None:
+        self._own.acquire()
+
+    def __exit__(self, *failure) -> None:
+        self._own.release()
+
+    @property
+    def _own(self) -> threading.RLock:
+        return self._locks.setdefault(os.getpid(), threading.RLock())
+
+
 class _Helper:
     """A thread that waits for one job after the other: less goes to and fro than with the futures of a pool."""
 

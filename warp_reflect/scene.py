@@ -8,7 +8,6 @@ Matrices act on columns: `p_world = world_from_object @ [p, 1]`.
 from __future__ import annotations
 
 import copy
-import threading
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
@@ -21,6 +20,7 @@ from warp_reflect.at_rest import AtRest, placed_normals, placed_points
 from warp_reflect.baked_maps import BakedMap
 from warp_reflect.bodies import Body, analyse, is_similarity
 from warp_reflect.cutouts import Cutouts, no_cutouts
+from warp_reflect.launch import Turns
 from warp_reflect.topology import closed_ranges, joined_neighbours
 
 wp.set_module_options({"enable_backward": False})
@@ -343,7 +343,7 @@ class Scene:
         self.notes = list(data.notes)
         self._reload = reload
         # Whose turn it is to draw one of the times of a stage, which fit the same trees (`alone`).
-        self.turn = threading.RLock() if earlier is None else earlier.turn
+        self.turn = Turns() if earlier is None else earlier.turn
         self.bodies: dict[int, Body] = {}
         # (*key of `AtRest`, what) -> what was found out about the shape of what moves, and which one that was.
         self.facts_at_rest: dict = {}

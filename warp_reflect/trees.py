@@ -5,12 +5,12 @@ Built once, fitted where points have moved.
 
 from __future__ import annotations
 
-import threading
 from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
 
+from warp_reflect.launch import Turns
 from warp_reflect.ray_tree import RayTree
 from warp_reflect.scene import Scene
 
@@ -39,7 +39,7 @@ class Tree:
         )
         of_triangle = None if groups is None else wp.array(groups, dtype=wp.int32, device=points.device)
         self.mesh = wp.Mesh(points, indices, groups=of_triangle, **kind)
-        self._making = threading.Lock()  # of what several threads that draw one scene ask for at once
+        self._making = Turns()  # of what several threads that draw one scene ask for at once
         self._wide: WideTree | None = None
         self._fitted: wp.array | None = points
         self._wide_fits = False

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+import signal
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -129,3 +132,27 @@ def test_threads_may_draw_times_of_a_stage_at_once():
     plan = wr.make_plan(first, **asked)
     for k, picture in enumerate(by_threads(4, lambda k: wr.render_frame(first.at(10.0 * (k + 1)), plan)["RGBA"])):
         np.testing.assert_array_equal(picture, known[k])
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are not forked here")
+def test_a_forked_process_waits_for_none_of_its_parents_threads():
+    """One of them draws, of a stage whose times take turns, while the process is forked."""
+    scene = wr.load_stage(Path(__file__).parents[2] / "usd_scenes" / "city_block.usda", time=1.0)
+    plan = wr.make_plan(scene, size=(32, 18), method="reference")
+    known, begun, done = wr.render_frame(scene, plan)["RGBA"], threading.Event(), threading.Event()
+
+    def hold():
+        with scene.alone(), scene.tracer._tree._making:
+            begun.set()
+            done.wait()
+
+    holder = threading.Thread(target=hold)
+    holder.start()
+    begun.wait()
+    child = os.fork()
+    if not child:
+        signal.alarm(60)  # ends a process that waits for ever
+        os._exit(0 if np.array_equal(wr.render_frame(scene, plan)["RGBA"], known) else 1)
+    done.set()
+    holder.join()
+    assert os.waitpid(child, 0)[1] == 0

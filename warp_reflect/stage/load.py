@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import threading
 from pathlib import Path
 
+from warp_reflect.launch import Turns
 from warp_reflect.scene import Note, Scene, SceneData
 
 
@@ -47,7 +47,7 @@ def load_stage(
     from warp_reflect.stage.read import StageReader
 
     arguments = path, purposes, complexity, strict, Limits(root=str(root)), reflectors
-    reader, reading = None if untrusted else StageReader(*arguments), threading.Lock()
+    reader, reading = None if untrusted else StageReader(*arguments), Turns()
 
     def at(code: float | None, known: Scene | None = None) -> Scene:
         if reader is None:
