@@ -84,9 +84,27 @@ def nearest_block(
         d[g] = vgather((const float*)directions.data, own);
         far[g] = gather(reach.data, own);
     }
-    find_blocked(valid, o, d, far, blocked);
-    for (int k = 0; k < BLOCK && block * BLOCK + k < count; ++k)
-        out_met.data[block * BLOCK + k] = blocked[k / LANES][k % LANES] != 0;
+    find_blocked(valid, o, d, far, blocked, tree_nodes, 1);
+    // Again from the leaves in the hull of them all, where the rays end somewhere: 2 where that answers otherwise.
+    V starts_low = same(3.0e38f), starts_high = same(-3.0e38f), ends_low = same(3.0e38f), ends_high = same(-3.0e38f);
+    unsigned endless = 0;
+    for (int g = 0; g < GROUPS; ++g) {
+        endless |= bits(valid[g] & (far[g] > 1.0e30f));
+        const V end = add(o[g], times(far[g], d[g]));
+        auto take_in = [&](F v, F& low, F& high) { low = fmin(v, low); high = fmax(v, high); };
+        take_in(o[g].x, starts_low.x, starts_high.x); take_in(end.x, ends_low.x, ends_high.x);
+        take_in(o[g].y, starts_low.y, starts_high.y); take_in(end.y, ends_low.y, ends_high.y);
+        take_in(o[g].z, starts_low.z, starts_high.z); take_in(end.z, ends_low.z, ends_high.z);
+    }
+    I again[GROUPS];
+    for (int g = 0; g < GROUPS; ++g) again[g] = blocked[g];
+    float leaves[8 * LEAVES_MOST];
+    const int found = endless ? -1 : leaves_within(shaft_of(starts_low, starts_high, ends_low, ends_high), leaves);
+    if (found >= 0) find_blocked(valid, o, d, far, again, leaves, found);
+    for (int k = 0; k < BLOCK && block * BLOCK + k < count; ++k) {
+        const int met = blocked[k / LANES][k % LANES] != 0;
+        out_met.data[block * BLOCK + k] = met == (again[k / LANES][k % LANES] != 0) ? met : 2;
+    }
 """
     )
 )

@@ -379,6 +379,32 @@ CODES += [SAME_TURN, FLATNESS, LEAST_COUNT, SHARP, LEAST_SPREAD, STEEP, TILE]
         const bool each_once = ray_count == known_count + 1;
         int together_count = BLOCK;
         bool round = true;
+        // What lies between the points and a shape is looked up once where as many packets as make up for that go that way.
+        constexpr int LOOKED_UP_FROM = 3 * BLOCK;
+        float leaves[8 * LEAVES_MOST];
+        const float* roots = tree_nodes;
+        int root_count = 1;
+        if (!distant && !to_sky && asking_count * (ray_count - known_count) >= LOOKED_UP_FROM) {
+            V low = same(3.0e38f), high = same(-3.0e38f);
+            for (int v = 0; v * LANES < asking_count; ++v) {
+                const V at = V{load(start[0] + v * LANES), load(start[1] + v * LANES), load(start[2] + v * LANES)};
+                low = V{fmin(at.x, low.x), fmin(at.y, low.y), fmin(at.z, low.z)};
+                high = V{fmax(at.x, high.x), fmax(at.y, high.y), fmax(at.z, high.z)};
+            }
+            // Of the shape, and wider by more than the rounding of its samples.
+            const auto& area = lights.areas.data[k];
+            float most[3];
+            for (int axis = 0; axis < 3; ++axis) {
+                const float across = __builtin_fabsf(area.x[axis]), along = __builtin_fabsf(area.y[axis]);
+                most[axis] = area.kind == sphere ? area.radius : across + (area.kind == cylinder ? area.radius : along);
+            }
+            const V centre = spread(area.centre), wide = times(F(1.0001f), V{F(most[0]), F(most[1]), F(most[2])});
+            const int found = leaves_within(shaft_of(low, high, sub(centre, wide), add(centre, wide)), leaves);
+            if (found >= 0) {
+                roots = leaves;
+                root_count = found;
+            }
+        }
         if (!distant && !each_once && asking_count > 0) {
             // Rays go together that start close to each other, or that end so: how many are asked for at once decides it.
             auto span = [&](const float* of_axis) -> float {
@@ -491,7 +517,7 @@ CODES += [SAME_TURN, FLATNESS, LEAST_COUNT, SHARP, LEAST_SPREAD, STEEP, TILE]
                     weight[g] = ray.weight;
                     sent[g] &= outside(area, p[g]) & (ray.weight > 0.0f);
                 }
-                find_blocked(sent, p, d, reach, met);
+                find_blocked(sent, p, d, reach, met, roots, root_count);
                 for (int g = 0; from + g * LANES < used; ++g) {
                     const int at = from + g * LANES;
                     const F brings = pick(sent[g], weight[g], F(0.0f)), arrives = pick(sent[g] & ~met[g], weight[g], F(0.0f));
