@@ -73,6 +73,11 @@ def straddle_kernel(
     """One thread per triangle: `STRADDLING` the hidden boundary, `FAILED` if a corner's search did, else 0."""
     i = first + wp.tid()
     t = triangles[i]
+    first_status = int(status[t[0]])
+    if first_status != MAX_ITERATIONS and int(status[t[1]]) == first_status and int(status[t[2]]) == first_status:
+        # Nearly all of them.
+        out_kind[i] = wp.uint8(0)
+        return
     hidden = int(0)
     solved = int(0)
     failed = int(0)

@@ -157,8 +157,18 @@ def cut_kernel(
     a = points[t[0]]
     b = points[t[1]]
     c = points[t[2]]
-    longest = wp.max(wp.length(b - a), wp.max(wp.length(c - b), wp.length(a - c))) * unit_per_scene
+    # The root of the longest's square is the longest root.
+    square = wp.max(wp.dot(b - a, b - a), wp.max(wp.dot(c - b, c - b), wp.dot(a - c, a - c)))
+    longest = wp.sqrt(square) * unit_per_scene
     shortest = float(1.0e30)
+    for k in range(3):
+        v = t[k]
+        if int(status[v]) == CONVERGED and reach[v] > 0.0:
+            shortest = wp.min(shortest, reach[v] * tolerance_root)
+    if longest <= shortest:
+        # Nearly all of them: where they appear need not be read.
+        out_cut[i] = wp.uint8(1)
+        return
     left = float(1.0e30)
     right = float(-1.0e30)
     top = float(1.0e30)
@@ -167,7 +177,6 @@ def cut_kernel(
     for k in range(3):
         v = t[k]
         if int(status[v]) == CONVERGED and reach[v] > 0.0:
-            shortest = wp.min(shortest, reach[v] * tolerance_root)
             p = screen[v]
             seen_corners += 1
             if p[2] > 0.0:
@@ -176,21 +185,15 @@ def cut_kernel(
                 top = wp.min(top, p[1])
                 bottom = wp.max(bottom, p[1])
     pieces = int(1)
-    if longest > shortest:
-        margin = BOX_MARGIN + 0.5 * wp.max(right - left, bottom - top)
-        seen = (
-            right + margin >= box[0]
-            and left - margin <= box[2]
-            and bottom + margin >= box[1]
-            and top - margin <= box[3]
-        )
-        if seen:
-            # Pieces of two pixels bend by less than one; the picture of a partly hidden triangle may be larger than known.
-            extent = wp.max(right - left, bottom - top)
-            if seen_corners < 3:
-                extent = float(CUT_MAX)
-            while pieces < CUT_MAX and 2.0 * float(pieces) < extent and longest > shortest * float(pieces):
-                pieces = pieces * 2
+    margin = BOX_MARGIN + 0.5 * wp.max(right - left, bottom - top)
+    seen = right + margin >= box[0] and left - margin <= box[2] and bottom + margin >= box[1] and top - margin <= box[3]
+    if seen:
+        # Pieces of two pixels bend by less than one; the picture of a partly hidden triangle may be larger than known.
+        extent = wp.max(right - left, bottom - top)
+        if seen_corners < 3:
+            extent = float(CUT_MAX)
+        while pieces < CUT_MAX and 2.0 * float(pieces) < extent and longest > shortest * float(pieces):
+            pieces = pieces * 2
     out_cut[i] = wp.uint8(pieces)
 
 
