@@ -400,12 +400,8 @@ def cull_kernel(
     step: int,
     out_survivors: wp.array(dtype=int),
     out_survivor_count: wp.array(dtype=int),
-    out_nearest: wp.array(dtype=float),
 ):
-    """One thread per triangle; each run of `step` triangles compacts its survivors at its own start.
-
-    Beside each stands the depth key of its nearest corner, infinite where the eye's own plane cuts it; length 0: not asked for.
-    """
+    """One thread per triangle; each run of `step` triangles compacts its survivors at its own start."""
     i = first + wp.tid()
     corners = triangles[i]
     a = screen[corners[0]]
@@ -422,11 +418,6 @@ def cull_kernel(
     part = i / step
     place = wp.atomic_add(out_survivor_count, part, 1)
     out_survivors[part * step + place] = i
-    if out_nearest.shape[0] > 0:
-        nearest = wp.max(a[2], wp.max(b[2], c[2]))
-        if a[2] == 0.0 or b[2] == 0.0 or c[2] == 0.0:
-            nearest = wp.inf
-        out_nearest[part * step + place] = nearest
 
 
 @wp.func
@@ -716,21 +707,15 @@ def rasterise(
         some = np.arange(0, count, BALANCED_BY)
         launch_bands(raster_rays_vector.draw_rays_kernel, vector.block_count(count), bands(some), inputs, device)
         return survivor_count
-    hides = False
-    if vectors:
+    if vectors and not stays(device):
         from warp_reflect import raster_vector  # as above
 
-        hides = target.box[2] - target.box[0] >= raster_vector.WIDTH_MIN
+        if target.box[2] - target.box[0] >= raster_vector.WIDTH_MIN:
+            return raster_vector.draw(target, screen, named, step, parts, threads)
     survivors = wp.empty(count, dtype=int, device=device)
     survivor_count = wp.zeros(-(-count // step), dtype=int, device=device)
-    nearest = wp.empty(count if hides else 0, dtype=float, device=device)
-    inputs = [target.view, screen, triangles, step, survivors, survivor_count, nearest]
-    if hides:
-        split = vector.BLOCK_SPLIT_MIN
-        runs_of = step // vector.BLOCK
-        launch(raster_vector.cull_blocks_kernel, vector.block_count(count), inputs, device, threads, split, runs_of)
-    else:
-        launch(cull_kernel, count, inputs, device, threads, align=step)
+    inputs = [target.view, screen, triangles, step, survivors, survivor_count]
+    launch(cull_kernel, count, inputs, device, threads, align=step)
     if stays(device):
         from warp_reflect import raster_pieces  # as above
 
@@ -738,27 +723,10 @@ def rasterise(
         return survivor_count
     runs = [slice(k * step, k * step + int(n)) for k, n in enumerate(survivor_count.numpy())]
     drawn = np.concatenate([survivors.numpy()[run] for run in runs])
-    if hides:
-        drawn = nearest_first(drawn, np.concatenate([nearest.numpy()[run] for run in runs]))
-    kernel, tasks, left = draw_kernel, len(drawn), planes
-    if hides:
-        kernel, tasks = raster_vector.draw_blocks_kernel, vector.block_count(len(drawn))
-        left = [wp.zeros(raster_vector.tile_words(target.box), dtype=wp.uint64, device=device)]
     numbers, length = (listed(each, device) for each in (drawn, np.array([len(drawn)], np.int32)))
-    inputs = [target.view, screen, *named, len(drawn), numbers, length, *left]
-    launch_bands(kernel, tasks, bands(drawn[::BALANCED_BY]), inputs, device)
+    inputs = [target.view, screen, *named, len(drawn), numbers, length, *planes]
+    launch_bands(draw_kernel, len(drawn), bands(drawn[::BALANCED_BY]), inputs, device)
     return survivor_count
-
-
-def nearest_first(survivors: np.ndarray, nearest: np.ndarray) -> np.ndarray:
-    """Survivors of a culling, the blocks with the nearest corners first: what lies behind need not be drawn.
-
-    Blocks stay together: neighbours in a mesh find each other's corners and pixels in the caches.
-    """
-    whole = len(survivors) // vector.BLOCK * vector.BLOCK
-    order = np.argsort(-nearest[:whole].reshape(-1, vector.BLOCK).max(axis=1), kind="stable")
-    blocks = survivors[:whole].reshape(-1, vector.BLOCK)[order].ravel()
-    return np.concatenate([blocks, survivors[whole:]])
 
 
 def balanced_bands(box: tuple[int, int, int, int], rows: np.ndarray, count: int) -> list[tuple[int, int]]:

@@ -13,15 +13,20 @@ vector reaches at most 15 pixels past the box); of larger ones in float64, whose
 
 from __future__ import annotations
 
+import numpy as np
 import warp as wp
 
 from warp_reflect import vector
+from warp_reflect.compact import listed
+from warp_reflect.launch import launch, launch_bands
 from warp_reflect.layers import CameraView
 from warp_reflect.raster import (
     GUARD,
     Clipped,
     PlaneView,
+    Target,
     TargetView,
+    balanced_bands,
     clip,
     draw_triangle,
     in_guard,
@@ -34,6 +39,7 @@ wp.set_module_options({"enable_backward": False})
 
 BLOCK = wp.constant(vector.BLOCK)
 WIDTH_MIN = 16  # pixels: the most lanes
+MOST_ROWS = 32767  # of a picture: half of 32 bits
 
 
 def tile_words(box: tuple[int, int, int, int]) -> int:
@@ -118,11 +124,13 @@ _TARGET = (
 @wp.func_native(
     vector.snippet(
         vector.TRIANGLES
+        + f"    constexpr int MOST_ROWS = {MOST_ROWS};"
         + r"""
     const int* corner_of = (const int*)triangles.data;
     const float* screen_of = (const float*)screen.data;
     const int end = begin + BLOCK < triangles.shape[0] ? begin + BLOCK : triangles.shape[0];
-    int survivors[BLOCK + LANES], nearest[BLOCK + LANES];
+    int survivors[BLOCK + LANES], rows[BLOCK + LANES];
+    float nearest[BLOCK + LANES];
     int count = 0;
     for (int start = begin; start < end; start += LANES) {
         const int length = end - start < LANES ? end - start : LANES;
@@ -141,14 +149,19 @@ _TARGET = (
         }
         const unsigned kept = cut | marks(c.sound & (c.left <= c.right) & (c.top <= c.bottom)) & valid;
         const F key = fmax(c.v[0].z, fmax(c.v[1].z, c.v[2].z)), farthest = fmin(c.v[0].z, fmin(c.v[1].z, c.v[2].z));
-        packed(nearest + count, __builtin_bit_cast(I, pick(farthest == 0.0f, F(__builtin_inff()), key)), kept);
+        packed((int*)nearest + count, __builtin_bit_cast(I, pick(farthest == 0.0f, F(__builtin_inff()), key)), kept);
+        packed(rows + count, ipick(c.clipped, I(MOST_ROWS << 16), c.top | c.bottom << 16), kept);
         count += packed(survivors + count, start + lanes(), kept);
     }
     int* place = out_survivor_count.data + begin / step;
     const int at = begin / step * step + *place;
     __builtin_memcpy(out_survivors.data + at, survivors, sizeof(int) * count);
-    __builtin_memcpy(out_nearest.data + at, nearest, sizeof(float) * count);
+    __builtin_memcpy(out_rows.data + at, rows, sizeof(int) * count);
     *place += count;
+    for (int k = 0; k < count; ++k) {
+        float& most = out_nearest.data[(at + k) / BLOCK];
+        most = (at + k) % BLOCK == 0 || nearest[k] > most ? nearest[k] : most;
+    }
 """
     )
 )
@@ -160,6 +173,7 @@ def cull_block(
     step: int,
     guard: float,
     out_survivors: wp.array(dtype=int),
+    out_rows: wp.array(dtype=int),
     out_survivor_count: wp.array(dtype=int),
     out_nearest: wp.array(dtype=float),
 ): ...
@@ -173,12 +187,17 @@ def cull_blocks_kernel(
     triangles: wp.array(dtype=wp.vec3i),
     step: int,
     out_survivors: wp.array(dtype=int),
+    out_rows: wp.array(dtype=int),
     out_survivor_count: wp.array(dtype=int),
     out_nearest: wp.array(dtype=float),
 ):
-    """As `raster.cull_kernel`, one thread per block of triangles; runs of `step` triangles begin at multiples of `BLOCK`."""
+    """As `raster.cull_kernel`, one thread per block of triangles; runs of `step` triangles begin at multiples of `BLOCK`.
+
+    Of each survivor there are the first and, times 65536, the last of its rows; of each block of survivors the depth key of the
+    nearest corner, infinite where the eye's own plane cuts a triangle.
+    """
     begin = (first + wp.tid()) * BLOCK
-    cull_block(begin, target, screen, triangles, step, GUARD, out_survivors, out_survivor_count, out_nearest)
+    cull_block(begin, target, screen, triangles, step, GUARD, out_survivors, out_rows, out_survivor_count, out_nearest)
 
 
 @wp.func_native(
@@ -199,6 +218,8 @@ def cull_blocks_kernel(
     for (int start = 0; start < count; start += LANES) {
         const int length = count - start < LANES ? count - start : LANES;
         const unsigned valid = (1u << length) - 1;
+        const I reached = iload(rows.data + begin + start);
+        if (!(marks(((reached & 65535) < row1) & ((reached >> 16) >= row0)) & valid)) continue;
         int corners[3 * LANES], number[LANES];
         for (int l = 0; l < LANES; ++l) {
             number[l] = numbers[start + (l < length ? l : 0)];
@@ -311,6 +332,7 @@ def draw_block(
     ids: wp.array(dtype=int),
     id_offset: int,
     survivors: wp.array(dtype=int),
+    rows: wp.array(dtype=int),
     begin: int,
     count: int,
     row_first: int,
@@ -409,17 +431,19 @@ def draw_blocks_kernel(
     id_offset: int,
     step: int,
     survivors: wp.array(dtype=int),
+    rows: wp.array(dtype=int),
     survivor_count: wp.array(dtype=int),
+    order: wp.array(dtype=int),
     tiles: wp.array(dtype=wp.uint64),
     row_first: int,
     row_end: int,
 ):
-    """As `raster.draw_kernel` into a target without rays, one thread per block of a slice's survivors.
+    """As `raster.draw_kernel` into a target without rays, one thread per block of what `cull_blocks_kernel` leaves.
 
-    Slices begin at multiples of `BLOCK`; the target is `WIDTH_MIN` pixels wide or more.
+    `order`: where the blocks begin. The target is `WIDTH_MIN` pixels wide or more.
     """
     task, _ = wp.tid()
-    begin = (first + task) * BLOCK
+    begin = order[first + task]
     part = begin / step
     count = wp.min(part * step + survivor_count[part] - begin, BLOCK)
     left = draw_block(
@@ -429,6 +453,7 @@ def draw_blocks_kernel(
         ids,
         id_offset,
         survivors,
+        rows,
         begin,
         count,
         row_first,
@@ -473,6 +498,38 @@ def draw_blocks_kernel(
                     draw_triangle(target, p, q, r, PlaneView(), triangle, row_first, row_end)
         left = left >> wp.uint64(1)
         i += 1
+
+
+def draw(target: Target, screen: wp.array, named: list, step: int, parts: int, threads: int) -> wp.array:
+    """Cull triangles and draw what is left; see `raster.rasterise`, which gives survivors in runs of `step` triangles.
+
+    Args:
+        named: Triangles, what the z-buffer stores of them, and what is added to their index otherwise.
+        parts: Threads that there are for it.
+    """
+    triangles, device = named[0], target.key.device
+    count = len(triangles)
+    survivors = wp.empty(count, dtype=int, device=device)
+    rows = wp.empty(count + BLOCK, dtype=int, device=device)  # vectors end behind the last one
+    survivor_count = wp.zeros(-(-count // step), dtype=int, device=device)
+    nearest = wp.empty(vector.block_count(count), dtype=float, device=device)
+    inputs = [target.view, screen, triangles, step, survivors, rows, survivor_count, nearest]
+    split, runs_of = vector.BLOCK_SPLIT_MIN, step // vector.BLOCK
+    launch(cull_blocks_kernel, vector.block_count(count), inputs, device, threads, split, runs_of)
+    # The blocks with the nearest corners first: what lies behind need not be drawn. Blocks stay together: neighbours in a mesh
+    # find each other's corners and pixels in the caches.
+    left = survivor_count.numpy()
+    order = np.concatenate(
+        [np.arange(k * step, k * step + n, vector.BLOCK, np.int32) for k, n in enumerate(left.tolist())]
+    )
+    order = order[np.argsort(-nearest.numpy()[order // vector.BLOCK], kind="stable")]
+    bands = [(target.box[1], target.box[3])]
+    if parts > 1:
+        bands = balanced_bands(target.box, rows.numpy()[order] & MOST_ROWS, parts)
+    tiles = wp.zeros(tile_words(target.box), dtype=wp.uint64, device=device)
+    inputs = [target.view, screen, *named, step, survivors, rows, survivor_count, listed(order, device), tiles]
+    launch_bands(draw_blocks_kernel, len(order), bands, inputs, device)
+    return survivor_count
 
 
 @wp.func_native(
