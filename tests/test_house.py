@@ -30,7 +30,7 @@ FLOORS = {
     "surface_vector pictures textures holes cut_shadows "
     "normal_maps bounces direct shadow_starts shadow_neighbours shadows transmission "
     "transmission_vector waves waves_vector channels stage stage.* scene_field "
-    "baked_environments shadow_starts_vector shadows_vector bvh_vector",
+    "baked_environments shadow_starts_vector shadow_lists shadows_vector bvh_vector",
     3: "solve solver solve_device solve_plane solve_convex solve_map solve_general solve_qim solver_gradients mirrors "
     "refraction solve_refraction solver_arrays reflector_maps techniques techniques.* finishes finishes.*",
     4: "kernels planner plan_rows detail mirrored_eyes effects lighting probe budget choice applicable calibration calibrate "

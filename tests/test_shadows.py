@@ -19,7 +19,7 @@ from test_shade import (
 )
 
 import warp_reflect as wr
-from warp_reflect import direct, raster, shade, shadows, surface
+from warp_reflect import direct, launch, raster, shade, shadows, surface
 from warp_reflect.scene import LightData, MaterialData, MeshData, Scene
 from warp_reflect.settings import Settings
 
@@ -115,6 +115,26 @@ def test_blocks_of_rays_find_what_single_rays_do(size, shared):
     for threads in (1, 2):
         blocks = shadows.shadowed_irradiance(scene, points, cast, threads).numpy()
         np.testing.assert_allclose(blocks, plain, rtol=1.0e-5, atol=1.0e-6)
+
+
+@pytest.mark.parametrize("shared", [False, True])
+@pytest.mark.parametrize("samples", [1, 7, 16, 80])
+def test_lists_of_rays_bring_the_same_on_a_device_and_on_threads(samples, shared):
+    """More samples than a ray's bits are told by among them, a shape that points lie in, and one that none asks."""
+    lights = [LAMPS["sphere"], distant((1, 2, 1), (0.2, 1.0, 0.1)), LAMPS["rect"], LAMPS["cylinder"]]
+    lights.append(LightData("/inside", "sphere", (1, 1, 1), place(0, 0.0, 0), size=(0.5,)))
+    scene = scene_of([(ground(), place(0.1, 0, 0), WHITE), (ground(CARD), place(0, CARD_HEIGHT, 0), WHITE)], lights)
+    camera = look_at((0.0, 5.0, 4.0), (0, 0, 0), fov=40.0, size=(70, 38))
+    points = direct.points_of(scene, raster.draw_scene(scene, camera))
+    cast = replace(shadows.every_shadow(scene, samples), shared=shared)
+    cast = replace(cast, areas=(True, True, False, True))
+    blocks = shadows.shadowed_irradiance(scene, points, cast).numpy()
+    with launch.as_device():
+        expected = shadows.shadowed_irradiance(scene, points, cast, kernels="plain").numpy()
+    np.testing.assert_allclose(expected, blocks, rtol=1.0e-5, atol=1.0e-6)
+    for threads in (1, 2, 3):
+        plain = shadows.shadowed_irradiance(scene, points, cast, threads, kernels="plain").numpy()
+        np.testing.assert_array_equal(plain, expected)
 
 
 def test_no_light_below_the_horizon_or_from_behind_a_shape():

@@ -49,6 +49,7 @@ FRAME = (
     "direct",
     "shadow_starts",
     "shadows",
+    "shadow_lists",
     "bvh",
     "bounces",
     "transmission",

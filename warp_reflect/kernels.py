@@ -106,7 +106,7 @@ def of_plan(plan: Plan) -> list[str]:
     seen = [row for row in plan.rows if row.pixels > 0]
     if plan.shadows is not None and plan.shadows.direct and plan.scene.triangle_count:
         cut = plan.scene.has_hole is not None
-        sent = ["-direct", "|shadow_starts_vector", "-shadow_starts/plain", "|shadows_vector", "-shadows/plain"]
+        sent = ["-direct", "|shadow_starts_vector", "-shadow_starts/plain", "|shadows_vector", "-shadow_lists"]
         asked += ["direct", "cut_shadows"] if cut else sent
         if not cut and FLAT_LIGHTS & {light.kind for light in plan.scene.data.lights}:
             asked.append("|shadow_starts_vector/flat")

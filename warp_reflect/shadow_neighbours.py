@@ -16,7 +16,7 @@ import warp as wp
 
 from warp_reflect import compact
 from warp_reflect.direct import Points
-from warp_reflect.launch import launch, reads
+from warp_reflect.launch import launch
 from warp_reflect.shadow_starts import Starts, row_vector
 
 wp.set_module_options({"enable_backward": False})
@@ -29,6 +29,9 @@ DARK = wp.constant(1)
 LIT = wp.constant(2)
 BOTH = wp.constant(3)
 LEVELS = wp.constant(63)  # of the share
+# Pixels of a tile: those whose rays 32 threads of a CUDA device send in step.
+TILE_WIDTH = wp.constant(8)
+TILE_HEIGHT = wp.constant(4)
 # Neighbours share what they found where they lie in the plane of a point: the cosine between facets, and the share of the
 # distance between two points that one may lie beside the other's plane.
 SAME_TURN = wp.constant(0.995)
@@ -48,6 +51,7 @@ class Neighbours:
     """Pictures with a border of `NEIGHBOURS` pixels, a row a shape: no neighbour lies outside of them."""
 
     width: int  # of the image
+    height: int
     pixel: wp.array(dtype=int)  # of points; length 0: point i is pixel i
     index: wp.array(dtype=int)  # of pixels: which point; length 0 likewise
     found: wp.array2d(dtype=wp.uint8)  # by the first rays
@@ -76,6 +80,24 @@ def place_of(around: Neighbours, i: int) -> int:
         number = around.pixel[i]
     row = number // around.width
     return number + 2 * NEIGHBOURS * row + NEIGHBOURS * (around.width + 2 * NEIGHBOURS) + NEIGHBOURS
+
+
+@wp.func
+def point_at(around: Neighbours, turn: int) -> int:
+    """The point of thread `turn` of `turn_count`: tile by tile, where it is known which point lies where; -1: none."""
+    if around.pixel.shape[0] > 0 and around.index.shape[0] == 0:
+        return turn
+    tile = turn // (TILE_WIDTH * TILE_HEIGHT)
+    across = (around.width + TILE_WIDTH - 1) // TILE_WIDTH
+    row = tile // across
+    within = turn - tile * (TILE_WIDTH * TILE_HEIGHT)
+    y = row * TILE_HEIGHT + within // TILE_WIDTH
+    x = (tile - row * across) * TILE_WIDTH + within % TILE_WIDTH
+    if x >= around.width or y >= around.height:
+        return -1
+    if around.index.shape[0] > 0:
+        return around.index[y * around.width + x]
+    return y * around.width + x
 
 
 @wp.func
@@ -149,6 +171,14 @@ def image_index_kernel(first: int, pixel: wp.array(dtype=int), out_index: wp.arr
         out_index[pixel[i]] = i
 
 
+def turn_count(around: Neighbours, count: int) -> int:
+    """Threads of a launch over all of so many points, by `point_at`."""
+    if len(around.pixel) and not len(around.index):
+        return count
+    width, height = int(TILE_WIDTH), int(TILE_HEIGHT)
+    return width * height * -(-around.width // width) * -(-around.height // height)
+
+
 def neighbours_of(points: Points, area_count: int, shared: bool, threads: int = 0) -> Neighbours:
     """Pictures of which nothing is known yet.
 
@@ -160,15 +190,10 @@ def neighbours_of(points: Points, area_count: int, shared: bool, threads: int = 
     """
     device = points.triangle.device
     around = Neighbours()
-    around.width, around.pixel = points.width, points.pixel
+    around.width, around.height, around.pixel = points.width, points.height, points.pixel
     around.index = compact.none(int, device)
     if area_count and len(points.pixel):
-        size = points.width * points.height
-        # Plain kernels do not ask which pixels show no point: they find nothing there.
-        plain = wp.get_device(device).is_cuda or not reads()
-        around.index = (
-            wp.empty(size, dtype=int, device=device) if plain else wp.full(size, -1, dtype=int, device=device)
-        )
+        around.index = wp.full(points.width * points.height, -1, dtype=int, device=device)
         launch(image_index_kernel, len(points.pixel), [points.pixel, around.index], device, threads)
     size = (points.width + 2 * NEIGHBOURS) * (points.height + 2 * NEIGHBOURS) + MARGIN
     around.found = wp.zeros((area_count, size), dtype=wp.uint8, device=device)

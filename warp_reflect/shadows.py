@@ -32,18 +32,7 @@ from warp_reflect.ray_query import any_met
 from warp_reflect.ray_walk import flush_direction
 from warp_reflect.scene import Scene
 from warp_reflect.settings import Settings
-from warp_reflect.shadow_neighbours import (
-    BOTH,
-    DARK,
-    LIT,
-    Neighbours,
-    entry_of,
-    found_around,
-    neighbours_of,
-    place_of,
-    share_of,
-    shared_share,
-)
+from warp_reflect.shadow_neighbours import neighbours_of
 from warp_reflect.shadow_starts import LEAST_SQUARE, RayStart, Starts, kept_room, row_vector, sample_place, starts_of
 from warp_reflect.shapes import unit
 
@@ -193,29 +182,6 @@ def area_shown(light: AreaView, p: wp.vec3) -> AreaView:
 
 
 @wp.func
-def area_share(mesh_id: wp.uint64, light: AreaView, start: RayStart, shift: wp.vec2, begin: int, end: int) -> float:
-    """Share of a shape's irradiance that arrives by samples begin to end, 0 to 1; 1 where none has anything to bring."""
-    p = start.p
-    n = start.n
-    if light.kind == SPHERE and wp.length(light.centre - p) <= light.radius:
-        return 1.0
-    shown = area_shown(light, p)
-    brought = float(0.0)
-    arrived = float(0.0)
-    k = int(begin)
-    while k < end:
-        ray = area_ray(light, shown, p, n, sample_place(k, shift))
-        if ray.weight > 0.0:
-            brought += ray.weight
-            if is_free(mesh_id, start, ray.direction, ray.reach):
-                arrived += ray.weight
-        k += 1
-    if brought == 0.0:
-        return 1.0
-    return arrived / brought
-
-
-@wp.func
 def start_of(starts: Starts, i: int) -> RayStart:
     """Where a point's rays start; of the point itself nothing is kept."""
     start = RayStart()
@@ -232,114 +198,34 @@ def shift_of(starts: Starts, i: int) -> wp.vec2:
 
 
 @wp.func
-def with_more(known: float, known_count: int, more: float, count: int) -> float:
-    """A share by `count` rays, of which so many have found what is known of it and the rest more."""
-    if known_count == 0:
-        return more
-    return (float(known_count) * known + float(count - known_count) * more) / float(count)
+def sample_ray(lights: DirectView, starts: Starts, k: int, i: int, sample: int) -> AreaRay:
+    """The ray from point i to a sample of shape k; none has anything to bring to what lies in a sphere.
 
-
-@wp.kernel(module=PLAIN)
-def first_rays_kernel(
-    first: int,
-    mesh_id: wp.uint64,
-    lights: DirectView,
-    cast_areas: wp.array(dtype=int),
-    starts: Starts,
-    count: int,
-    out_around: Neighbours,
-):
-    """One thread per point: what the first rays towards each shape find."""
-    i = first + wp.tid()
-    place = place_of(out_around, i)
-    for k in range(lights.areas.shape[0]):
-        if cast_areas[k] != 0 and starts.unshadowed[k, i] > 0.0:
-            share = area_share(mesh_id, lights.areas[k], start_of(starts, i), shift_of(starts, i), 0, count)
-            out_around.found[k, place] = wp.uint8(entry_of(share))
-
-
-@wp.kernel(module=PLAIN)
-def shared_rays_kernel(
-    first: int,
-    mesh_id: wp.uint64,
-    lights: DirectView,
-    cast_areas: wp.array(dtype=int),
-    starts: Starts,
-    known_count: int,
-    count: int,
-    out_around: Neighbours,
-):
-    """One thread per point: what it has for its neighbours, `BOTH` where they have something for it."""
-    i = first + wp.tid()
-    place = place_of(out_around, i)
-    for k in range(lights.areas.shape[0]):
-        if cast_areas[k] != 0 and starts.unshadowed[k, i] > 0.0:
-            entry = int(out_around.found[k, place])
-            if found_around(out_around, k, place) == BOTH:
-                start = start_of(starts, i)
-                more = area_share(mesh_id, lights.areas[k], start, shift_of(starts, i), known_count, count)
-                entry = BOTH | entry_of(with_more(share_of(entry), known_count, more, count))
-            out_around.shared[k, place] = wp.uint8(entry)
-
-
-@launch.few_registers
-@wp.kernel(module=PLAIN)
-def shadowed_kernel(
-    first: int,
-    mesh_id: wp.uint64,
-    lights: DirectView,
-    cast_distant: wp.array(dtype=int),
-    cast_areas: wp.array(dtype=int),
-    starts: Starts,
-    known_count: int,
-    count: int,
-    around: Neighbours,
-    out_irradiance: wp.array(dtype=wp.vec3),
-):
-    """One thread per point: the irradiance of all lights but the domes.
-
-    Of the samples, neighbours share `known_count`; 0: they share nothing.
+    All of it is read anew for each: what would be kept while a ray is on its way leaves a CUDA device less to wait with.
     """
-    i = first + wp.tid()
+    light = lights.areas[k]
     start = start_of(starts, i)
-    total = wp.vec3(0.0, 0.0, 0.0)
-    for k in range(lights.distant.shape[0]):
-        to_light = lights.distant[k].to_light
-        cosine = wp.dot(start.n, to_light)
-        if cosine > 0.0:
-            lit = bool(True)
-            if cast_distant[k] != 0:
-                lit = is_free(mesh_id, start, to_light, FAR)
-            if lit:
-                total += cosine * lights.distant[k].irradiance
-    place = place_of(around, i)
-    for k in range(lights.areas.shape[0]):
-        light = lights.areas[k]
-        unshadowed = starts.unshadowed[k, i]
-        if unshadowed > 0.0:
-            share = float(1.0)
-            if cast_areas[k] != 0:
-                known = float(0.0)
-                found = int(BOTH)
-                if known_count > 0:
-                    entry = int(around.shared[k, place])
-                    found = entry & BOTH
-                    known = share_of(entry)
-                    share = float(-1.0)
-                    if found == BOTH:
-                        share = shared_share(around, starts, k, place, i)
-                else:
-                    found = found_around(around, k, place)
-                    share = float(-1.0)
-                if found == DARK:
-                    share = float(0.0)
-                elif found == LIT:
-                    share = float(1.0)
-                elif share < 0.0:
-                    more = area_share(mesh_id, light, start, shift_of(starts, i), known_count, count)
-                    share = with_more(known, known_count, more, count)
-            total += unshadowed * share * light.radiance
-    out_irradiance[i] = total
+    if light.kind == SPHERE and wp.length(light.centre - start.p) <= light.radius:
+        return AreaRay()
+    return area_ray(light, area_shown(light, start.p), start.p, start.n, sample_place(sample, shift_of(starts, i)))
+
+
+@wp.func
+def area_share(mesh_id: wp.uint64, lights: DirectView, starts: Starts, k: int, i: int, begin: int, end: int) -> float:
+    """Share of shape k's irradiance that arrives at point i by samples begin to end, 0 to 1; 1 where none brings anything."""
+    brought = float(0.0)
+    arrived = float(0.0)
+    sample = int(begin)
+    while sample < end:
+        ray = sample_ray(lights, starts, k, i, sample)
+        if ray.weight > 0.0:
+            brought += ray.weight
+            if is_free(mesh_id, start_of(starts, i), ray.direction, ray.reach):
+                arrived += ray.weight
+        sample += 1
+    if brought == 0.0:
+        return 1.0
+    return arrived / brought
 
 
 @wp.kernel(module=TRIED)
@@ -365,7 +251,7 @@ def light_shares_kernel(
             if wp.dot(start.n, to_light) > 0.0 and not is_free(mesh_id, start, to_light, FAR):
                 share = float(0.0)
         elif starts.unshadowed[k - distant, i] > 0.0:
-            share = area_share(mesh_id, lights.areas[k - distant], start, shift_of(starts, i), 0, count)
+            share = area_share(mesh_id, lights, starts, k - distant, i, 0, count)
         out_share[i * light_count + k] = share
 
 
@@ -451,31 +337,19 @@ def shadowed_irradiance(
     result = wp.empty(count, dtype=wp.vec3, device=device)
     around = neighbours_of(points, len(areas) if any(cast.areas) else 0, cast.shared, threads)
     samples = first_count(cast.samples), shared_count(cast.samples) if cast.shared else 0, cast.samples
-    send = _irradiance
+    # Either sends this module's rays.
     if vector.chosen(kernels, device):
-        from warp_reflect import shadows_vector  # which sends this module's rays
+        from warp_reflect import shadows_vector as sent
 
-        send, mesh = shadows_vector.irradiance, wp.uint64(scene.shadow_tracer.packets)
+        mesh = wp.uint64(scene.shadow_tracer.packets)
+    else:
+        from warp_reflect import shadow_lists as sent
     with kept_room(scene, count) as room:
         starts = starts_of(
             scene, points, normals, len(areas), threads, kernels=kernels, room=room, shaped=len(areas) > 0
         )
-        send(mesh, lights, [distant, areas], starts, count, samples, around, result, threads)
+        sent.irradiance(mesh, lights, [distant, areas], starts, count, samples, around, result, threads)
     return result
-
-
-def _irradiance(mesh, lights, cast, starts, count, samples, around, out_irradiance, threads) -> None:
-    """As `shadows_vector.irradiance`."""
-    first, shared, whole = samples
-
-    def send(kernel, inputs: list) -> None:
-        launch.launch(kernel, count, [mesh, lights, *inputs], starts.rows.device, threads, split_min=TRACE_SPLIT_MIN)
-
-    if len(around.found):
-        send(first_rays_kernel, [cast[1], starts, first, around])
-        if shared:
-            send(shared_rays_kernel, [cast[1], starts, first, shared, around])
-    send(shadowed_kernel, [*cast, starts, shared, whole, around, out_irradiance])
 
 
 def sky_share(

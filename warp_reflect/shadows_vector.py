@@ -714,7 +714,7 @@ def irradiance(
     out_irradiance: wp.array,
     threads: int = 0,
 ) -> None:
-    """As `shadows.first_rays_kernel`, `shadows.shared_rays_kernel` and `shadows.shadowed_kernel`.
+    """As `shadow_lists.irradiance`, whose kernels send rays of single points.
 
     Args:
         mesh: `bvh.Tracer.packets` of what casts shadows.
