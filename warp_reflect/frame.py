@@ -129,6 +129,8 @@ class Frame:
     def __getitem__(self, name: str) -> np.ndarray:
         """A channel, float32 [height, width] or [height, width, n].
 
+        On a CPU it may be the frame's own memory, and that of a later frame in which nothing moved: copy it to write to it.
+
         Args:
             name: A group such as `N`, `reflectedPoint`, `RGBA`, or one component such as `N.X`, `R`.
 
@@ -265,7 +267,7 @@ class Frame:
 
 
 def render_frame(scene: Scene, plan: Plan, camera: str | Camera | None = None, previous: Frame | None = None) -> Frame:
-    """Render a scene as planned.
+    """Render a scene as planned. Several threads may: see `Scene.alone`.
 
     Args:
         scene: The plan's scene, or the same stage at another time, which is planned anew (`Frame.plan`).
