@@ -506,14 +506,11 @@ class Turns:
         self._locks: dict[int, threading.RLock] = {}
 
     def __enter__(self) -> None:
-        self._own.acquire()
+        process = os.getpid()
+        (self._locks.get(process) or self._locks.setdefault(process, threading.RLock())).acquire()
 
     def __exit__(self, *failure) -> None:
-        self._own.release()
-
-    @property
-    def _own(self) -> threading.RLock:
-        return self._locks.setdefault(os.getpid(), threading.RLock())
+        self._locks[os.getpid()].release()
 
 
 class _Helper:

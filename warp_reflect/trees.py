@@ -61,14 +61,16 @@ class Tree:
 
     def to(self, points: wp.array) -> Tree:
         """Fit it to points, if it is not."""
-        with self._making:
-            if self._fitted is not points:
-                if self.mesh.points is not points:
-                    wp.copy(self.mesh.points, points)
-                self.mesh.refit()
-                if self._rays is not None:
-                    self._rays.fit()
-                self._fitted, self._wide_fits = points, False
+        if self._fitted is not points:  # asked twice: a frame asks dozens of times, and nearly always it is
+            with self._making:
+                if self._fitted is not points:
+                    if self.mesh.points is not points:
+                        wp.copy(self.mesh.points, points)
+                    self.mesh.refit()
+                    if self._rays is not None:
+                        self._rays.fit()
+                    self._wide_fits = False
+                    self._fitted = points
         return self
 
     def loosen(self) -> None:
@@ -87,14 +89,15 @@ class Tree:
     @property
     def wide(self) -> WideTree:
         """The structure that packets walk down; as `packets`."""
-        with self._making:
-            if self._wide is None:
-                from warp_reflect.wide_tree import WideTree  # not compiled where there are no packets
+        if not self._wide_fits:
+            with self._making:
+                if self._wide is None:
+                    from warp_reflect.wide_tree import WideTree  # not compiled where there are no packets
 
-                self._wide = WideTree(self.mesh)
-            elif not self._wide_fits:
-                self._wide.fit()
-            self._wide_fits = True
+                    self._wide = WideTree(self.mesh)
+                elif not self._wide_fits:
+                    self._wide.fit()
+                self._wide_fits = True
         return self._wide
 
 
