@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
-from warp_reflect import launch, surface
+from warp_reflect import compact, launch, surface
 from warp_reflect.counts import Statistics
 from warp_reflect.frame import Frame, render_frame
 from warp_reflect.layers import Camera, MirrorPixels, ReflectionLayer
@@ -309,12 +309,14 @@ def _told_behind(found: Transmission, width: int) -> Transmission | None:
     if not pixels.count:
         return None
     rays = found.layer.pixels
-    turned = replace(pixels.turned(rays.direction[where], rays.normal[where]), reflector=rays.reflector)
-    arrays = {name: getattr(found, name)[where] for name in ("weight", "inside", "nearness")}
+    taken = [compact.taken(array, where) for array in (rays.direction, rays.normal)]
+    turned = replace(pixels.turned(*taken), reflector=rays.reflector)
+    arrays = {name: compact.taken(getattr(found, name), where) for name in ("weight", "inside", "nearness")}
     layer = _cut(found.layer, where, turned, found.layer.statistics.anew())
     return replace(found, surface=pixels, layer=layer, **arrays)
 
 
-def _cut(layer: ReflectionLayer, where: slice, pixels: MirrorPixels, counted: Statistics) -> ReflectionLayer:
-    arrays = {name: getattr(layer, name)[where] for name in ("triangle", "u", "v", "distance", "status")}
+def _cut(layer: ReflectionLayer, where: wp.array, pixels: MirrorPixels, counted: Statistics) -> ReflectionLayer:
+    names = ("triangle", "u", "v", "distance", "status")
+    arrays = {name: compact.taken(getattr(layer, name), where) for name in names}
     return replace(layer, pixels=pixels, statistics=counted, whole=None, **arrays)

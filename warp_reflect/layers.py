@@ -242,8 +242,8 @@ class MirrorPixels:
         box: (x0, y0, x1, y1), half-open bounds of the pixels.
         whole: Those of several reflectors, one after the other, whose slice from `first` to `end` these are; None: they
             are alone.
-        run: Where nothing is read (`launch.unread`) there are as many entries as the picture has pixels, of which those
-            without a pixel have the number -1; which ones have one is on the device (`surface.told`). None: all of them.
+        everywhere: Where nothing is read (`launch.unread`) every pixel of the picture has its entry, which has the pixel's own
+            number, or -1 where that does not show the reflector (`surface.told`).
     """
 
     reflector: int
@@ -255,7 +255,7 @@ class MirrorPixels:
     whole: MirrorPixels | None = None
     first: int = 0
     end: int = 0
-    run: wp.array | None = None
+    everywhere: bool = False
 
     @property
     def count(self) -> int:
@@ -267,19 +267,17 @@ class MirrorPixels:
             return replace(self, reflector=reflector, box=box)
         return _part(self, first, end, reflector=reflector, box=box)
 
-    def told(self) -> tuple[int, int]:
-        """The first of the entries that have a pixel, and their end, where they are `run`; read now."""
-        return tuple(self.run.numpy()[:2].tolist())
-
     def turned(self, direction: wp.array, normal: wp.array | None = None) -> MirrorPixels:
         """The same pixels with rays that go elsewhere, and with normals that would send them there."""
         normal = self.normal if normal is None else normal
-        return MirrorPixels(self.reflector, self.pixel, self.point, normal, direction, self.box, run=self.run)
+        return MirrorPixels(
+            self.reflector, self.pixel, self.point, normal, direction, self.box, everywhere=self.everywhere
+        )
 
     def follows(self, other: MirrorPixels) -> bool:
         """Whether they lie right behind another reflector's, as far as there are any."""
-        if self.run is not None:
-            return other.run is not None
+        if self.everywhere:
+            return other.everywhere
         return self.whole is not None and self.whole is other.whole and self.first == other.end
 
     @staticmethod
@@ -287,7 +285,7 @@ class MirrorPixels:
         """Those of several reflectors, each of which follows the one before, as if they were the first one's."""
         if len(pixels) == 1:
             return pixels[0]
-        if pixels[0].run is not None:
+        if pixels[0].everywhere:
             return replace(pixels[0], pixel=_united([each.pixel for each in pixels]))
         left, top, right, bottom = zip(*(each.box for each in pixels), strict=True)
         box = min(left), min(top), max(right), max(bottom)
@@ -372,7 +370,7 @@ class ReflectionLayer:
             shaded at the hits.
         whole: The layer of several reflectors that all are answered and shaded together, whose slice from `first` to `end`
             this one is; None: it is alone.
-        shares: Of a whole, for each reflector: what gives its first ray and the end of its rays, and its statistics.
+        shares: Of a whole, for each reflector: what tells which of some rays are its own, and its statistics.
     """
 
     pixels: MirrorPixels
@@ -391,7 +389,7 @@ class ReflectionLayer:
     whole: ReflectionLayer | None = None
     first: int = 0
     end: int = 0
-    shares: list[tuple[Callable[[], tuple[int, int]], Statistics]] = field(default_factory=list)
+    shares: list[tuple[Callable[[np.ndarray], np.ndarray], Statistics]] = field(default_factory=list)
 
     @classmethod
     def unset(cls, pixels: MirrorPixels, method: int, device) -> ReflectionLayer:
@@ -421,10 +419,8 @@ class ReflectionLayer:
         made, end = [], 0
         for each in pixels:
             first, end = end, end + each.count
-            told, run, own = each.told, (0, self.pixels.count), Statistics()
-            if each.run is None:
-                run = first, end
-                told = partial(tuple, run)
+            run, own = (0, self.pixels.count) if each.everywhere else (first, end), Statistics()
+            told = partial(_shown, each.pixel) if each.everywhere else partial(_between, *run)
             made.append(_part(self, *run, pixels=each, statistics=own, timings={}, virtual=[], cells=[], shares=[]))
             self.shares.append((told, own))
         return made
@@ -437,14 +433,22 @@ class ReflectionLayer:
             rays: Gives their numbers among the layer's.
         """
         numbers = cache(rays) if reads() else rays
-        for place, statistics in self.shares or [(partial(tuple, (0, self.pixels.count)), self.statistics)]:
-            statistics.later(partial(_counted, name, numbers, place))
+        for own, statistics in self.shares or [(partial(_between, 0, self.pixels.count), self.statistics)]:
+            statistics.later(partial(_counted, name, numbers, own))
 
 
-def _counted(name: str, numbers: Callable[[], np.ndarray], place: Callable[[], tuple[int, int]]) -> dict[str, int]:
-    first, end = place()
-    count = int(np.count_nonzero((numbers() >= first) & (numbers() < end)))
+def _counted(name: str, numbers: Callable[[], np.ndarray], own: Callable[[np.ndarray], np.ndarray]) -> dict[str, int]:
+    count = int(np.count_nonzero(own(numbers())))
     return {name: count} if count else {}
+
+
+def _between(first: int, end: int, numbers: np.ndarray) -> np.ndarray:
+    return (numbers >= first) & (numbers < end)
+
+
+def _shown(pixel: wp.array, numbers: np.ndarray) -> np.ndarray:
+    """Which of some entries, -1 for none, show a pixel; read now."""
+    return (numbers >= 0) & (pixel.numpy()[numbers] >= 0)
 
 
 def undivided(layers: Iterable[ReflectionLayer]) -> list[ReflectionLayer]:

@@ -31,6 +31,7 @@ wp.set_module_options({"enable_backward": False})
 PLAIN = launch.module_part(__name__, "plain")  # what vector kernels do elsewhere
 CHANNELS = launch.module_part(__name__, "channels")
 SORTED = launch.module_part(__name__, "sorted")
+UNREAD = launch.module_part(__name__, "unread")
 
 Run = tuple[int, int, Box]  # of an id's pixels: the first, the end, their bounds
 
@@ -450,13 +451,8 @@ def _pixels_by_id(ids: np.ndarray, wanted: Collection[int]) -> tuple[np.ndarray,
     return np.concatenate(list(found.values())), dict(zip(found, edges, strict=True))
 
 
+FARTHEST = wp.constant(2**30)  # more than a picture has rows or columns
 RUN = wp.constant(6)  # numbers of an id's run: first, end; first and last row; columns left of the right end, its end
-
-
-@wp.func
-def run_box(run: wp.array(dtype=int), width: int) -> wp.vec4i:
-    """Bounds of an id's pixels on the device, as `_box` on the host; of a picture of that width."""
-    return wp.vec4i(width - run[4], run[2], run[5], run[3] + 1)
 
 
 @wp.kernel(module=SORTED)
@@ -508,20 +504,6 @@ def runs_kernel(
         wp.atomic_max(out_run, own * RUN + 5, column + 1)
 
 
-@wp.kernel(module=SORTED)
-def own_pixels_kernel(
-    first: int,
-    id: wp.array(dtype=int),
-    pixel: wp.array(dtype=int),
-    least: int,
-    most: int,
-    out_pixel: wp.array(dtype=int),
-):
-    """One thread per pixel, sorted by id: it, or -1 where its id is another."""
-    i = first + wp.tid()
-    out_pixel[i] = wp.where(id[i] >= least and id[i] <= most, pixel[i], -1)
-
-
 def _sorted(ids: wp.array, most: int, width: int) -> tuple[wp.array, wp.array, wp.array]:
     """(ids, ascending; their pixels, ascending in each; `RUN` numbers of each id up to the largest)."""
     count, device = len(ids), ids.device
@@ -534,29 +516,75 @@ def _sorted(ids: wp.array, most: int, width: int) -> tuple[wp.array, wp.array, w
     return id, pixel, runs
 
 
+@wp.kernel(module=UNREAD)
+def own_pixels_kernel(first: int, ids: wp.array(dtype=int), least: int, most: int, out_pixel: wp.array(dtype=int)):
+    """One thread per pixel: it, or -1 where its id is another."""
+    i = first + wp.tid()
+    out_pixel[i] = wp.where(ids[i] >= least and ids[i] <= most, i, -1)
+
+
 def _unread_pixels(scene: Scene, gbuffer: GBuffer, ids: wp.array, wanted: Collection[int]) -> dict[int, MirrorPixels]:
     """The pixels of every id where nothing is read: each alone, in as many entries as there are pixels."""
-    most, width = max(wanted), gbuffer.camera.size[0]
-    id, pixel, runs = _sorted(ids, most, width)
 
     def own(least: int, most: int) -> wp.array:
         numbers = wp.empty(len(ids), dtype=int, device=scene.device)
-        launch.launch(own_pixels_kernel, len(ids), [id, pixel, least, most, numbers], scene.device)
+        launch.launch(own_pixels_kernel, len(ids), [ids, least, most, numbers], scene.device)
         return numbers
 
-    whole = _met(scene, gbuffer, own(1, most), 1, "plain")
-    found = {}
-    for k in wanted:
-        numbers = whole.pixel if len(wanted) == 1 else own(k, k)
-        found[k] = replace(whole, reflector=k, pixel=numbers, run=compact.run(runs, k * RUN, (k + 1) * RUN))
-    return found
+    whole = replace(_met(scene, gbuffer, own(1, max(wanted)), 1, "plain"), everywhere=True)
+    return {k: replace(whole, reflector=k, pixel=whole.pixel if len(wanted) == 1 else own(k, k)) for k in wanted}
 
 
-def told(pixels: MirrorPixels, width: int) -> tuple[slice, MirrorPixels]:
-    """Where among their entries pixels stand that were found where nothing was read, and these alone; read now."""
-    start, end, *edges = pixels.run.numpy().tolist()
-    arrays = (compact.run(array, start, end) for array in (pixels.pixel, pixels.point, pixels.normal, pixels.direction))
-    return slice(start, end), MirrorPixels(pixels.reflector, *arrays, _box(width, *edges))
+def told(pixels: MirrorPixels, width: int) -> tuple[wp.array, MirrorPixels]:
+    """Which entries of pixels that were found where nothing was read have one, and these alone; read now."""
+    numbers = np.flatnonzero(pixels.pixel.numpy() >= 0)
+    where = compact.listed(numbers, pixels.pixel.device)
+    arrays = (compact.taken(array, where) for array in (pixels.pixel, pixels.point, pixels.normal, pixels.direction))
+    return where, MirrorPixels(pixels.reflector, *arrays, pixel_bounds(numbers, width))
+
+
+@wp.kernel(module=UNREAD)
+def bounds_kernel(first: int, pixel: wp.array(dtype=int), width: int, out_bounds: wp.array(dtype=int)):
+    """One thread per pixel; those that have others on all sides tell nothing new."""
+    i = first + wp.tid()
+    if pixel[i] < 0:
+        return
+    row = i // width
+    column = i - row * width
+    left = column == 0
+    if not left:
+        left = pixel[i - 1] < 0
+    right = column == width - 1
+    if not right:
+        right = pixel[i + 1] < 0
+    top = row == 0
+    if not top:
+        top = pixel[i - width] < 0
+    bottom = i + width >= pixel.shape[0]
+    if not bottom:
+        bottom = pixel[i + width] < 0
+    if left:
+        wp.atomic_max(out_bounds, 0, FARTHEST - column)
+    if top:
+        wp.atomic_max(out_bounds, 1, FARTHEST - row)
+    if right:
+        wp.atomic_max(out_bounds, 2, column + 1)
+    if bottom:
+        wp.atomic_max(out_bounds, 3, row + 1)
+
+
+def bounds_of(pixels: MirrorPixels, width: int) -> wp.array:
+    """Bounds of pixels where nothing is read, for `bounds_box`."""
+    device = pixels.pixel.device
+    bounds = wp.zeros(4, dtype=int, device=device)
+    launch.launch(bounds_kernel, len(pixels.pixel), [pixels.pixel, width, bounds], device)
+    return bounds
+
+
+@wp.func
+def bounds_box(bounds: wp.array(dtype=int)) -> wp.vec4i:
+    """The bounds as a `Box`; of no pixels its ends lie before its starts."""
+    return wp.vec4i(FARTHEST - bounds[0], FARTHEST - bounds[1], bounds[2], bounds[3])
 
 
 def _box(width: int, top: int, bottom: int, before: int, right: int) -> Box:

@@ -842,7 +842,9 @@ class _Walk:
         counted = launch.mark(device)
         onward, ended = wp.zeros(n, dtype=wp.uint16, device=device), wp.zeros(n, dtype=wp.uint8, device=device)
         point, normal, direction, inside, weight, fading, way = behind
-        rays = replace(layer.pixels, pixel=pixel, point=point, normal=normal, direction=direction, run=None, whole=None)
+        rays = replace(
+            layer.pixels, pixel=pixel, point=point, normal=normal, direction=direction, everywhere=False, whole=None
+        )
 
         def still(triangle: wp.array) -> None:
             launch.launch(next_surface_kernel, 1, [depth, going.mark], device)

@@ -7,7 +7,7 @@ import warp as wp
 
 from warp_reflect import compact, launch
 from warp_reflect.layers import MirrorPixels
-from warp_reflect.surface import run_box
+from warp_reflect.surface import bounds_box, bounds_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -102,15 +102,14 @@ def look_up_level(pyramid: Pyramid, picture: int, x: float, y: float, level: int
 @wp.kernel
 def measure_kernel(
     first: int,
-    run: wp.array(dtype=int),
-    image_width: int,
+    bounds: wp.array(dtype=int),
     most: int,
     # Outputs, see `Pyramid`:
     out_told: wp.array(dtype=int),
     out_first: wp.array(dtype=int),
 ):
     """One thread: as `empty_pyramid`, of pixels whose bounds are on the device; of so many levels at most."""
-    box = run_box(run, image_width)
+    box = bounds_box(bounds)
     i = first + wp.tid()
     out_told[i + 1] = box[0]
     out_told[i + 2] = box[1]
@@ -170,12 +169,12 @@ def empty_pyramid(pixels: MirrorPixels, device, pictures: int = 1, levels: int =
     sizes = [_level_texels(pyramid, level) for level in range(levels)]
     pyramid.texels = sum(sizes)
     pyramid.color = wp.zeros(pictures * pyramid.texels, dtype=wp.vec4, device=device)
-    if pixels.run is None:
+    if not pixels.everywhere:
         pyramid.first = wp.array(np.cumsum([0, *sizes[:-1]]).astype(np.int32), dtype=int, device=device)
         pyramid.told = compact.none(int, device)
     else:
         pyramid.first, pyramid.told = (wp.empty(count, dtype=int, device=device) for count in (levels, TOLD))
-        inputs = [pixels.run, image_width, levels, pyramid.told, pyramid.first]
+        inputs = [bounds_of(pixels, image_width), levels, pyramid.told, pyramid.first]
         launch.launch(measure_kernel, 1, inputs, device)
     return pyramid
 

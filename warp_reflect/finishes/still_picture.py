@@ -6,7 +6,7 @@ import warp as wp
 
 from warp_reflect import compact, launch, vector
 from warp_reflect.layers import MirrorPixels
-from warp_reflect.surface import run_box
+from warp_reflect.surface import bounds_box, bounds_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -22,8 +22,7 @@ class StillPicture:
         texels: Radiance and nearness: 1 / distance from the surface's plane, 0 for the sky, `NOT_SEEN` with radiance 0.
         x0, y0: The frame's pixel that is the first texel.
         width, height: Of the texels.
-        run, image_width: `MirrorPixels.run` where nothing is read, and the frame's width: the bounds are on the device
-            (`placed`). Of length 0: they are these.
+        bounds: Where nothing is read those of the surface's pixels, on the device (`placed`). Of length 0: the others tell.
     """
 
     texels: wp.array(dtype=wp.vec4)
@@ -31,8 +30,7 @@ class StillPicture:
     y0: int
     width: int
     height: int
-    run: wp.array(dtype=int)
-    image_width: int
+    bounds: wp.array(dtype=int)
 
 
 @wp.func
@@ -44,8 +42,8 @@ def placed(picture: StillPicture) -> StillPicture:
     result.y0 = picture.y0
     result.width = picture.width
     result.height = picture.height
-    if picture.run.shape[0] > 0:
-        box = run_box(picture.run, picture.image_width)
+    if picture.bounds.shape[0] > 0:
+        box = bounds_box(picture.bounds)
         result.x0 = box[0] - 1
         result.y0 = box[1] - 1
         result.width = box[2] - box[0] + 2
@@ -131,7 +129,7 @@ def make_picture(
     device = radiance.device
     x0, y0, x1, y1 = pixels.box
     picture = StillPicture()
-    picture.run, picture.image_width = compact.none(int, device) if pixels.run is None else pixels.run, image_width
+    picture.bounds = bounds_of(pixels, image_width) if pixels.everywhere else compact.none(int, device)
     picture.x0, picture.y0, picture.width, picture.height = x0 - 1, y0 - 1, x1 - x0 + 2, y1 - y0 + 2
     texels = wp.vec4(0.0, 0.0, 0.0, float(NOT_SEEN))
     picture.texels = wp.full(picture.width * picture.height, texels, dtype=wp.vec4, device=device)
