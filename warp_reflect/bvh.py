@@ -459,7 +459,8 @@ def _trace(
         some = _with_status(layer, index, Status.NONE) if known else asked
         inputs = [*rays, *some, known, 0, int(blank), compact.none(wp.uint8, scene.device), *outputs]
         launch.launch(trace_pixels_kernel, len(some[0]), inputs, scene.device, threads, split_min=TRACE_SPLIT_MIN)
-    if left or missed:
+    # What CUDA walks loses no ray (`ray_query.py`).
+    if (left or missed) and not scene.device.is_cuda:
         some = _with_status(layer, index, Status.SKY) if known else asked
         # The neighbours' answers are read from a copy, so that the order of threads cannot matter.
         inputs = [*rays, *some, 0, 0, 0, wp.clone(layer.status), *outputs]

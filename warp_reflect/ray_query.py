@@ -100,7 +100,9 @@ _WALK = r"""
             if (c != PAST) stack[size++] = child(c);
             if (b != PAST) stack[size++] = child(b);
             current = a != PAST ? child(a) : stack[--size];
-        } else {
+        }
+        // Not `else`: who has come to a leaf goes on with those that wait at one.
+        if (current < 0 && current != END) {
             int at = 3 * ~current;
             bool last;
             do {
@@ -162,6 +164,11 @@ def first_walked(handle: wp.uint64, origin: wp.vec3, direction: wp.vec3, reach: 
 @wp.func_native(_ANY)
 def any_walked(handle: wp.uint64, origin: wp.vec3, direction: wp.vec3, reach: float) -> bool:
     """`any_met` likewise."""
+
+
+@wp.func_native(_on_cuda("return 0;", "return 1;"))
+def loses_rays() -> int:
+    """1 where a ray may go past what it is aimed at a corner of, by rounding: one that meets nothing is worth asking again."""
 
 
 @wp.func

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from warp_reflect.ray_query import first_met, triangle_in
+from warp_reflect.ray_query import first_met, loses_rays, triangle_in
 from warp_reflect.scene import SceneView
 from warp_reflect.settings import Status
 from warp_reflect.shapes import clamp_weights, facet_normal, intersect_triangle, max_abs
@@ -22,7 +22,7 @@ FLOAT_EPS = wp.constant(1.1920929e-7)  # one ulp of 1 in float32
 OFFSET_ULPS = wp.constant(16.0)
 # A convex body is left after two crossings; shared edges and the start may count twice.
 MAX_STEPS = wp.constant(8)
-# The box test of wp.mesh_query_ray rounds to nearest, not outwards, and loses up to 1.5e-2 of the rays aimed
+# On a CPU: the box test of wp.mesh_query_ray rounds to nearest, not outwards, and loses up to 1.5e-2 of the rays aimed
 # exactly at a vertex. Moved by this many ulp a ray has left the corner's box planes (2.5e-6 lost are left, at
 # any offset); 1e-6 of the distance is no more than the rounding of a hit.
 RETRY_ULPS = wp.constant(8.0)
@@ -213,7 +213,7 @@ def trace_ray_from(
             at its origin exactly.
         facet: Triangle that the ray starts on, never hit; -1 none, and then `body` is empty too.
         body: The mirror around it. A convex one is stepped over, of others what the ray leaves from behind.
-        retry: 1: a ray that finds nothing is asked once more, turned by a few ulp.
+        retry: 1: a ray that finds nothing is asked once more, turned by a few ulp, where that may be a rounding's doing.
         t_first: What is nearer is not met.
         known: What is met first where t_first is 0, if that was asked before.
 
@@ -230,7 +230,7 @@ def trace_ray_from(
         offset = float(0.0)
 
     t0 = float(t_first)
-    asked = int(0)
+    asked = int(1 - loses_rays())
     step = int(0)
     # A range over the constant would be unrolled, eight traversals long.
     while step < MAX_STEPS:
@@ -315,7 +315,7 @@ def trace_onward(
     start = origin + offset * normal
     part = scene.patches[scene.triangle_patch[facet]].part
     t0 = float(t_first)
-    asked = int(0)
+    asked = int(1 - loses_rays())
     step = int(0)
     while step < MAX_STEPS:
         step += 1
