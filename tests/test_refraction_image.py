@@ -1,6 +1,7 @@
 """What lies behind flat water as its virtual image shows it, against rays: hits, hard views, and what the plan says of it."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from panes import GLASS, WATER, balls, stage, with_finish
 from rooms import placed, sphere, square
 
 import warp_reflect as wr
+from warp_reflect import effects
 from warp_reflect.launch import launch
 from warp_reflect.layers import CameraView
 from warp_reflect.scene import MaterialData
@@ -161,7 +163,7 @@ def test_points_are_seen_by_the_law_of_refraction(ior, height):
     np.testing.assert_allclose(screens[1].numpy()[before], screens[0].numpy()[before], rtol=1e-3, atol=1e-3)
 
 
-def test_the_plan_says_how_and_why():
+def test_the_plan_says_how_and_why(monkeypatch):
     water = square(1, 20.0), placed(0, 0, -3), WATER
     scene = stage(water, *balls())
 
@@ -170,6 +172,13 @@ def test_the_plan_says_how_and_why():
         return plan.panes[0].effects["refraction_image"]
 
     on = effect(scene)
+    plan = wr.make_plan(scene, size=SIZE)
+    ask = scene, plan.panes[0].part, "solid", plan.panes[0].pixels
+    for refraction, asked in (("auto", False), ("drawn", True)):
+        with monkeypatch.context() as patched:
+            patched.setattr(scene, "device", SimpleNamespace(is_cuda=True))
+            there = effects.refraction_effect(*ask, wr.Settings(refraction=refraction), plan.camera, "auto")
+        assert there.on == asked and (asked or "GPU" in there.reason)
     assert on.on and "triangles under it" in on.reason and "(refraction=auto)" in on.reason
     assert not effect(scene, refraction="traced").on
     assert "reference" in effect(scene, method="reference").reason

@@ -192,6 +192,9 @@ def refraction_effect(
         return Effect(False, "refraction=traced")
     if camera.orthographic:
         return Effect(False, "a parallel camera's rays are traced")
+    if settings.refraction == "auto" and scene.device.is_cuda:
+        # The host cuts the image's triangles: 14.6 ms a frame of `pool` at 1280x720 on an H100, 10.1 by rays.
+        return Effect(False, "a GPU follows rays sooner than the host cuts an image (refraction=auto)")
     from warp_reflect.techniques import refraction_image
 
     drawn, reason, numbers = refraction_image.applies(scene, part, pixels)
