@@ -22,7 +22,12 @@ from warp_reflect import kernels, launch, warmup
 # What `--warp-debug` runs where no files are named: tests that launch all kernels in seconds; file to names ("": all of it).
 BOUNDS = {
     "test_bumps.py": ("test_map_of_one_direction_mirrors_as_tilted_corners_do[lookup",),
-    "test_captured.py": ("test_a_repeated_frame_copies_its_camera_alone",),
+    "test_captured.py": (
+        "test_a_repeated_frame_copies_its_camera_alone",
+        "test_a_repeated_frame_is_the_launched_one_bit_for_bit[kitchen-settings5",
+        "test_a_repeated_frame_is_the_launched_one_bit_for_bit[panes",
+        "test_normal_maps_and_waves_turn_the_rays_of_repeated_frames",
+    ),
     "test_compact.py": ("",),
     "test_cutouts.py": ("test_hundreds_of_holes", "test_a_distant_light"),
     "test_environment.py": ("test_coarser_levels_keep_the_mean",),

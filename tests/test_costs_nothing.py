@@ -117,7 +117,7 @@ CASES = {
     ),
     "shadows": Case(
         lights=(SUN,),
-        owns=("shadows",),
+        owns=("shadows", "shadow_lists"),
         twin={"settings": {"shadows": "off"}},
         holds=lambda f: f.plan.shadows is not None,
     ),

@@ -231,6 +231,7 @@ def times(stage: str, size: tuple[int, int], arguments, llvm: bool) -> list[dict
     import warp_reflect as wr
     from warp_reflect.images import write_png
 
+    wr.keep_freed_memory()  # as every program that draws many frames does
     mitsuba = importlib.util.find_spec("mitsuba") is not None
     scene, mirrors = diffuse_stage(stage, size) if mitsuba else (wr.load_stage(stage), set())
     base = wr.Settings(

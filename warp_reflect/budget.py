@@ -85,7 +85,7 @@ BUILT_IN = Costs()
 # Likewise of a CUDA device, all of its threads together: an NVIDIA H100. What the host does one launch after the other is
 # `layer`; what it still does for every vertex of a mesh that is made or cut anew makes those dear.
 ON_CUDA = Costs(
-    trace=0.004,
+    trace=0.0021,
     mirrored=0.05,
     quadric_cold=0.073,
     quadric_warm=0.002,
@@ -94,8 +94,8 @@ ON_CUDA = Costs(
     branches=1.2,
     bent=0.15,
     cut=0.2,
-    draw=0.0011,
-    covered=0.0017,
+    draw=0.0025,
+    covered=0.0002,
     interpolated=0.089,
     candidate=0.00013,
     refined=0.00053,
@@ -106,11 +106,11 @@ ON_CUDA = Costs(
     blended=0.0005,
     followed=0.00015,
     eye_triangle=0.0006,
-    eye_pixel=0.0003,
-    mirror_pixel=0.0013,
-    gathered=0.0003,
+    eye_pixel=0.0001,
+    mirror_pixel=0.0009,
+    gathered=0.0007,
     through=0.0009,
-    shadow=0.0005,
+    shadow=0.00014,
     layer=364.0,
     forward=1456.0,
 )
