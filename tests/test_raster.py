@@ -121,6 +121,19 @@ def test_result_does_not_depend_on_order_or_threads():
     assert (corners[order][permuted][..., 0, 2] == corners[ids][..., 0, 2]).all()
 
 
+@pytest.mark.parametrize("count", [4033, 4080, 4095, 4096])
+def test_one_run_of_survivors_is_one_threads(count):
+    """Triangles of one run that are as many blocks as launches are split at, the last of them not whole."""
+    rng = np.random.default_rng(count)
+    corners = flat(rng.uniform(-4.0, 68.0, (count, 1, 2)) + rng.uniform(-3.0, 3.0, (count, 3, 2)))
+    corners[..., 2] = rng.uniform(0.05, 0.9, (count, 1))
+    first, first_keys = draw(corners, 64, 64, threads=1)
+    for _ in range(150):
+        again, again_keys = draw(corners, 64, 64, threads=2)
+        np.testing.assert_array_equal(again, first)
+        np.testing.assert_array_equal(again_keys, first_keys)
+
+
 def test_equal_depth_goes_to_lower_id():
     triangle = [[0, 0], [16, 0], [0, 16]]
     ids, _ = draw(flat([triangle, triangle]), 16, 16)

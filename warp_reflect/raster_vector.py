@@ -514,7 +514,7 @@ def draw(target: Target, screen: wp.array, named: list, step: int, parts: int, t
     survivor_count = wp.zeros(-(-count // step), dtype=int, device=device)
     nearest = wp.empty(vector.block_count(count), dtype=float, device=device)
     inputs = [target.view, screen, triangles, step, survivors, rows, survivor_count, nearest]
-    split, runs_of = vector.BLOCK_SPLIT_MIN, step // vector.BLOCK
+    split, runs_of = vector.BLOCK_SPLIT_MIN, vector.block_count(step)  # the only run may end within a block
     launch(cull_blocks_kernel, vector.block_count(count), inputs, device, threads, split, runs_of)
     # The blocks with the nearest corners first: what lies behind need not be drawn. Blocks stay together: neighbours in a mesh
     # find each other's corners and pixels in the caches.
