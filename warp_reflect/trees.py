@@ -37,8 +37,8 @@ class Tree:
             if points.device.is_cuda
             else {"bvh_constructor": "sah"}
         )
-        of_triangle = None if groups is None else wp.array(groups, dtype=wp.int32, device=points.device)
-        self.mesh = wp.Mesh(points, indices, groups=of_triangle, **kind)
+        self._groups = None if groups is None else wp.array(groups, dtype=wp.int32, device=points.device)
+        self.mesh = wp.Mesh(points, indices, groups=self._groups, **kind)
         self._making = Turns()  # of what several threads that draw one scene ask for at once
         self._wide: WideTree | None = None
         self._fitted: wp.array | None = points
@@ -55,7 +55,8 @@ class Tree:
                 self._rays = RayTree(self.mesh)
                 if not self._rays.is_whole:
                     # Some branch is much longer than the others; where each is of half the triangles, none is.
-                    self.mesh = wp.Mesh(self.mesh.points, self.mesh.indices, bvh_constructor="median")
+                    points, indices = self.mesh.points, self.mesh.indices
+                    self.mesh = wp.Mesh(points, indices, groups=self._groups, bvh_constructor="median")
                     self._rays = RayTree(self.mesh)
             return self._rays.id
 
